@@ -5,8 +5,6 @@ read the names from ``__init__.pyi``.
 """
 
 import importlib
-import sys
-from types import ModuleType
 from typing import Any
 
 _NAMES_OF_MODULE = {
@@ -37,6 +35,7 @@ _NAMES_OF_MODULE = {
     "sim2real.graph.episode": ("MemoryRecorder",),
     "sim2real.graph.rebuilding": ("rebuild",),
     "sim2real.graph.schedule": ("draw",),
+    "sim2real.identification.search": ("minimise",),
     "sim2real.runtime.asynchronous": ("AsyncGraph",),
     "sim2real.runtime.clock": ("Clock",),
     "sim2real.runtime.compiled.graph": ("CompiledGraph",),
@@ -56,39 +55,8 @@ _NAMES_OF_MODULE = {
 _MODULE_OF_NAME = {name: module for module, names in _NAMES_OF_MODULE.items() for name in names}
 _MODULES = ("interop",)
 """Modules whose functions users call as ``sim2real.interop.vector_env(...)`` without an import of the module."""
-_CALLABLE_PACKAGES = ("identify",)
-"""Packages with the name of a public function: ``sim2real.identify`` is the function."""
 
 __all__ = sorted(_MODULE_OF_NAME)  # pyright: ignore[reportUnsupportedDunderAll] - the stub lists the names
-
-
-class _Package(ModuleType):
-    """This package. Python sets each imported subpackage as an attribute; here the function of that name stays."""
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if not (name in _CALLABLE_PACKAGES and isinstance(value, ModuleType)):
-            super().__setattr__(name, value)
-
-
-class _CallablePackage(ModuleType):
-    """A package whose attributes are also attributes of its function: ``sim2real.identify.delays``."""
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        super().__setattr__(name, value)
-        function = vars(sys.modules[__name__]).get(self.__name__.rpartition(".")[2])
-        if function is not None:
-            setattr(function, name, value)
-
-
-sys.modules[__name__].__class__ = _Package
-
-
-def callable_package(name: str) -> None:
-    """Make ``sim2real.identify(...)`` run the stage although ``sim2real.identify`` is also a package.
-
-    The package calls this while Python imports it.
-    """
-    sys.modules[name].__class__ = _CallablePackage
 
 
 def __getattr__(name: str) -> Any:
@@ -103,11 +71,6 @@ def __getattr__(name: str) -> Any:
         value = getattr(importlib.import_module(_MODULE_OF_NAME[name]), name)
     else:
         raise AttributeError(f"module 'sim2real' has no attribute {name!r}")
-    if name in _CALLABLE_PACKAGES:
-        # The modules that were imported before become attributes of the function; later ones follow by __setattr__.
-        package = importlib.import_module(f"sim2real.{name}")
-        value.__dict__.update({n: m for n, m in vars(package).items() if isinstance(m, ModuleType)})
-        value.__dict__.update({n: getattr(package, n) for n in getattr(package, "__all__", ())})
     # Python calls __getattr__ for missing names only: the next use takes the value from the module.
     globals()[name] = value
     return value

@@ -32,6 +32,7 @@ from sim2real.graph import TrainableDist as TrainableDist
 from sim2real.graph.episode import MemoryRecorder as MemoryRecorder
 from sim2real.graph.rebuilding import rebuild as rebuild
 from sim2real.graph.schedule import draw as draw
+from sim2real.identification.search import minimise as minimise
 from sim2real.runtime.asynchronous import AsyncGraph as AsyncGraph
 from sim2real.runtime.clock import Clock as Clock
 from sim2real.runtime.compiled.graph import CompiledGraph as CompiledGraph
@@ -49,5 +50,3 @@ from sim2real.view.graphs import plot_graph as plot_graph
 from sim2real.view.graphs import plot_timeline as plot_timeline
 
 __version__: str
-
-def callable_package(name: str) -> None: ...

@@ -368,7 +368,7 @@ def test_public_names_are_listed_where_they_come_from():
         for name in node.names
     }
     assert typed == {(module, name) for name, module in sim2real._MODULE_OF_NAME.items()}
-    assert set(sim2real.__all__) == set(sim2real._MODULE_OF_NAME) >= set(sim2real._CALLABLE_PACKAGES)
+    assert set(sim2real.__all__) == set(sim2real._MODULE_OF_NAME)
     assert sim2real.Sim2RealError is errors.Sim2RealError
     with pytest.raises(AttributeError, match="no attribute 'Nothing'"):
         _ = sim2real.Nothing

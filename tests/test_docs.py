@@ -50,7 +50,7 @@ MARKS = {
     "docs/reference/identification.md": [NIGHT],
     "docs/reference/runs.md": [NIGHT],
     "docs/tutorial.md": [NIGHT],
-    "sim2real.identify": [NIGHT],
+    "sim2real.identification": [NIGHT],
     "sim2real.runtime": [NIGHT],
 }
 TINY_FIT = '{"generations": 2, "population": 8, "refine_steps": 3, "folds": 0, "free_run_s": 0.0}'
@@ -63,7 +63,7 @@ SMALLER = {
         ", recording)": f", recording, {TINY_FIT})",
         ", identification)": f", identification, {TINY_PPO})",
     },
-    "sim2real.identify": {"FitConfig()": "FitConfig(population=8, generations=2, refine_steps=3)"},
+    "sim2real.identification": {"FitConfig()": "FitConfig(population=8, generations=2, refine_steps=3)"},
 }
 """Page -> what it computes -> what is computed here instead."""
 FILES = {
@@ -93,7 +93,7 @@ TRUE = {
         "abs(reward(Measurement(3.141592653589793)) + 1.0) < 1e-6",
     ],
     "docs/tutorial.md": ["test_the_head_is_a_robot(folder) is None"],
-    "sim2real.identify": ["judgement.status and (spread.low <= spread.high).all()"],
+    "sim2real.identification": ["judgement.status and (spread.low <= spread.high).all()"],
     "sim2real.runtime": ["abs(float(simulated) - float(of_first_episode)) < 1e-6 and of_all_episodes.shape == (4,)"],
 }
 """Page -> what its text says about the names that its blocks leave behind."""
@@ -110,7 +110,7 @@ def optional(block: str) -> set[str]:
     "page",
     [
         pytest.param(page, marks=MARKS.get(page, []))
-        for page in [*(p.relative_to(ROOT).as_posix() for p in PAGES), "sim2real.identify", "sim2real.runtime"]
+        for page in [*(p.relative_to(ROOT).as_posix() for p in PAGES), "sim2real.identification", "sim2real.runtime"]
         if python_of(page)
     ],
 )

@@ -10,7 +10,7 @@ import numpy as np
 from sim2real import pytree
 from sim2real.arrays import namespace
 from sim2real.graph.base import Array, Base, GraphState, StepState
-from sim2real.identify.parameters import Parameter
+from sim2real.identification.parameters import Parameter
 from sim2real.later import jnp
 from sim2real.robots.agent import DirectAgent
 from sim2real.worlds.joint import Forces, JointState, JointWorld

@@ -11,8 +11,8 @@ import numpy as np
 
 from sim2real.arrays import namespace
 from sim2real.errors import SafetyStop
-from sim2real.identify.model import Channel, PlainSimulation
-from sim2real.identify.parameters import Parameter
+from sim2real.identification.model import Channel, PlainSimulation
+from sim2real.identification.parameters import Parameter
 from sim2real.later import jax, jnp
 from sim2real.policy.contract import ActionTerm, ObservationTerm
 from sim2real.robots.agent import AgentParams

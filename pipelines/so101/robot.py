@@ -14,7 +14,7 @@ import numpy as np
 
 from sim2real.arrays import namespace
 from sim2real.errors import UsageError
-from sim2real.identify.parameters import Parameter
+from sim2real.identification.parameters import Parameter
 from sim2real.later import jax, jnp
 from sim2real.robots.messages import JointReading
 from sim2real.robots.probe import Probe

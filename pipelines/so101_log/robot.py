@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim2real.graph.node import BaseNode
-from sim2real.identify.model import Channel
-from sim2real.identify.parameter_paths import get_leaf
-from sim2real.identify.parameters import Parameter
+from sim2real.identification.model import Channel
+from sim2real.identification.parameter_paths import get_leaf
+from sim2real.identification.parameters import Parameter
 from sim2real.robots.identified import LoggedRobot
 from sim2real.worlds.recorded import RecordedActuator
 

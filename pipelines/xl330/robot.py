@@ -7,8 +7,8 @@ from typing import Any
 import jax.numpy as jnp
 
 from sim2real.graph.node import BaseNode
-from sim2real.identify.model import Channel
-from sim2real.identify.parameters import Parameter
+from sim2real.identification.model import Channel
+from sim2real.identification.parameters import Parameter
 from sim2real.robots.identified import LoggedRobot
 from sim2real.worlds.recorded import RecordedActuator, RecordedSensor
 

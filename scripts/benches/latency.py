@@ -27,8 +27,8 @@ from benches import jobs
 from benches.recorded import rigs
 from benches.recorded.sets import Recording
 from benches.rows import Report, Row, four_digits, markdown, row, share
-from sim2real.identify.delay_likelihood import DelayEvidence
-from sim2real.identify.delays import find, lost_share
+from sim2real.identification.delay_likelihood import DelayEvidence
+from sim2real.identification.delays import find, lost_share
 
 KINDS = {
     "fixed": "8 ms",

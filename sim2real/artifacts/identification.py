@@ -582,7 +582,7 @@ class Identification(Shown):
         samples: Columns of the segments ``(N,)``: ``t``, ``into`` (since the segment's start) [s], ``segment``,
             ``recording``, ``held_out``, and ``FIELD_measured`` and ``FIELD_MODEL`` of each field.
         free: The same columns of the free runs; empty without free runs.
-        replays: Initial states and commands of held-out segments and free runs; see ``identify.predictions.replays``.
+        replays: Initial states and commands of held-out segments and free runs.
         timing: Timing of the first recording, from which training draws its delays; None if only the estimates exist.
     """
 

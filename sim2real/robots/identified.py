@@ -13,8 +13,8 @@ from sim2real.errors import UsageError
 from sim2real.graph.delays import TrainableDist
 from sim2real.graph.episode import Episode, named_leaves
 from sim2real.graph.node import BaseNode
-from sim2real.identify.model import Channel
-from sim2real.identify.parameters import Parameter, ParameterTable
+from sim2real.identification.model import Channel
+from sim2real.identification.parameters import Parameter, ParameterTable
 from sim2real.later import jnp
 from sim2real.robots.loop import ACTUATOR, SENSOR, WORLD
 from sim2real.robots.messages import EpisodeStart
@@ -68,7 +68,7 @@ class LoggedRobot(RecordedRobot):
 
 
 class IdentifiableRecording:
-    """Simulates what the sensor measured from recorded commands; an ``identify.model.IdentifiableModel``.
+    """Simulates what the sensor measured from recorded commands; an ``identification.model.IdentifiableModel``.
 
     Args:
         max_delay_s: Upper bound of the delay [s].

@@ -16,7 +16,7 @@ from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.delays import TrainableDist
 from sim2real.graph.episode import Episode, named_leaves
 from sim2real.graph.node import BaseNode, Scheduling
-from sim2real.identify.parameters import Parameter, ParameterTable
+from sim2real.identification.parameters import Parameter, ParameterTable
 from sim2real.later import jax, jnp
 from sim2real.robots.messages import EpisodeStart
 from sim2real.training.environment.tasks import Rewards
@@ -229,7 +229,7 @@ def draw_values(key: jax.Array, values: Mapping[str, float], draws: Mapping[str,
 
 
 class IdentifiableLoop:
-    """Simulates the sensor's measurements from recorded commands; an ``identify.model.IdentifiableModel``.
+    """Simulates the sensor's measurements from recorded commands; an ``identification.model.IdentifiableModel``.
 
     Args:
         max_delay_s: Upper bound of each of the two delays [s].

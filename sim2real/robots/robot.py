@@ -21,8 +21,8 @@ from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState
 from sim2real.graph.delays import DelayDistribution
 from sim2real.graph.node import BaseNode, NodeOptions
-from sim2real.identify.model import Channel, IdentifiableModel, PlainSimulation, position_of
-from sim2real.identify.parameters import Parameter
+from sim2real.identification.model import Channel, IdentifiableModel, PlainSimulation, position_of
+from sim2real.identification.parameters import Parameter
 from sim2real.later import jax, jnp
 from sim2real.policy.contract import ActionTerm, ObservationTerm
 from sim2real.policy.runner import Runner

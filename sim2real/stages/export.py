@@ -13,13 +13,13 @@ from sim2real.artifacts.identification import UNFINISHED, Identification
 from sim2real.artifacts.run.manifest import sha256
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
-from sim2real.identify.export.card import differing, write_card
-from sim2real.identify.export.document import json_document
-from sim2real.identify.export.mjcf import Late, late_mjcf
-from sim2real.identify.export.targets import isaaclab_source, mjlab_source
-from sim2real.identify.export.terms import Terms, find_delays, find_terms, values_of
-from sim2real.identify.model import IdentifiableModel
-from sim2real.identify.parameters import ParameterTable
+from sim2real.identification.export.card import differing, write_card
+from sim2real.identification.export.document import json_document
+from sim2real.identification.export.mjcf import Late, late_mjcf
+from sim2real.identification.export.targets import isaaclab_source, mjlab_source
+from sim2real.identification.export.terms import Terms, find_delays, find_terms, values_of
+from sim2real.identification.model import IdentifiableModel
+from sim2real.identification.parameters import ParameterTable
 from sim2real.installation import version
 from sim2real.log.reader import read_log
 from sim2real.robots.loop import SENSOR

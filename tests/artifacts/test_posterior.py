@@ -5,7 +5,7 @@ import pytest
 
 from sim2real.artifacts.files import read_json, write_json
 from sim2real.artifacts.posterior import Posterior
-from sim2real.identify.parameters import Parameter, ParameterTable
+from sim2real.identification.parameters import Parameter, ParameterTable
 
 
 @pytest.fixture

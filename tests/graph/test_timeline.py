@@ -11,7 +11,7 @@ from sim2real.graph import BaseNode, Timeline
 from sim2real.graph.episode import MemoryRecorder, MessageRecord, StepRecord
 from sim2real.graph.schedule import draw
 from sim2real.graph.times import NEVER, search_rows
-from sim2real.identify.segments import cut_timeline
+from sim2real.identification.segments import cut_timeline
 
 
 def same(a: Timeline, b: Timeline):

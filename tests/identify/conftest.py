@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from sim2real.graph.episode import Episode, Steps
-from sim2real.identify.config import FitConfig
-from sim2real.identify.fit import run_search
-from sim2real.identify.problem import Problem
-from sim2real.identify.segments import Span
-from sim2real.identify.uncertainty import from_linearised
+from sim2real.identification.config import FitConfig
+from sim2real.identification.fit import run_search
+from sim2real.identification.problem import Problem
+from sim2real.identification.segments import Span
+from sim2real.identification.uncertainty import from_linearised
 from sim2real.stages.config import RecordConfig
 from sim2real.stages.excitation.signals import excitation
 from sim2real.stages.pipeline.pipeline import load_pipeline

@@ -10,10 +10,10 @@ from flax import struct
 from sim2real.graph.base import Base
 from sim2real.graph.episode import Episode, Steps
 from sim2real.graph.node import BaseNode, BaseWorld
-from sim2real.identify.config import FitConfig
-from sim2real.identify.model import Channel
-from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.identify.segments import Span
+from sim2real.identification.config import FitConfig
+from sim2real.identification.model import Channel
+from sim2real.identification.parameters import Parameter, ParameterTable
+from sim2real.identification.segments import Span
 
 TICK_S, PERIOD_S, DURATION_S, LENGTH_S = 0.01, 0.02, 10.0, 1.0
 GAIN, TAU_S, BIAS, NOISE = 1.7, 0.13, 0.2, 0.002

@@ -5,7 +5,7 @@ import pytest
 from scipy import optimize, stats
 
 from sim2real.errors import UsageError
-from sim2real.identify.uncertainty import aggregate
+from sim2real.identification.uncertainty import aggregate
 
 # Eight randomised trials of intravenous magnesium, log odds ratios and their standard errors' squares: any effects do.
 EFFECTS = np.array([0.095, 0.277, 0.367, 0.664, 0.462, 0.185])

@@ -7,9 +7,9 @@ import pytest
 
 from sim2real.artifacts.posterior import Posterior
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.identify.drift import Fitted, Way, _beside_the_rest, drift, ways, weigh
-from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.identify.residuals import Linearised
+from sim2real.identification.drift import Fitted, Way, _beside_the_rest, drift, ways, weigh
+from sim2real.identification.parameters import Parameter, ParameterTable
+from sim2real.identification.residuals import Linearised
 
 TABLE = ParameterTable(
     [

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from sim2real.artifacts.identification import AHEAD, FREE_RUN, HeldOutPart, Identification, Judgement, Prediction
-from sim2real.identify.expected import wider_for, with_expected_errors
-from sim2real.identify.verdict import Position
+from sim2real.identification.expected import wider_for, with_expected_errors
+from sim2real.identification.verdict import Position
 
 JOINT = Position("position[0]", "pan", "rad", 0.001)
 NO_MOTION = np.zeros(40)

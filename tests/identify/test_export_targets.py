@@ -7,9 +7,9 @@ import mujoco
 import pytest
 
 from sim2real.errors import UsageError
-from sim2real.identify.export.mjcf import Late, late_mjcf
-from sim2real.identify.export.targets import isaaclab_source, mjlab_source
-from sim2real.identify.export.terms import Delays, Term, Terms
+from sim2real.identification.export.mjcf import Late, late_mjcf
+from sim2real.identification.export.targets import isaaclab_source, mjlab_source
+from sim2real.identification.export.terms import Delays, Term, Terms
 
 NAMES = ("arm/pan/joint", "tilt.joint")
 ABOUT = [("verdict", "accepted"), ("log", 'a "quoted" name'), ("not expressed", "eccentricity")]

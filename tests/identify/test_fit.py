@@ -8,12 +8,12 @@ from lag import BIAS, CONFIG, GAIN, LENGTH_S, TAU_S, Model, lag_log, spans
 from test_residuals import OutsideModel
 
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.identify import fit as fitting
-from sim2real.identify.config import FitConfig
-from sim2real.identify.fit import fit, refine, remaining
-from sim2real.identify.parameters import ParameterTable
-from sim2real.identify.problem import Problem
-from sim2real.identify.segments import Span
+from sim2real.identification import fit as fitting
+from sim2real.identification.config import FitConfig
+from sim2real.identification.fit import fit, refine, remaining
+from sim2real.identification.parameters import ParameterTable
+from sim2real.identification.problem import Problem
+from sim2real.identification.segments import Span
 
 TABLE = Model.parameters.with_fixed({"square": 0.0})
 TRUTH = {"gain": GAIN, "tau": TAU_S, "bias": BIAS}

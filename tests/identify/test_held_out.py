@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from lag import BIAS, CONFIG, LENGTH_S, NOISE, Model, lag_log, spans
 
 from sim2real.errors import UsageError
-from sim2real.identify import held_out
-from sim2real.identify.fit import fit, refine, refit
-from sim2real.identify.held_out import REFITS, Fold, Refits, folds_of, leave_out, moving
-from sim2real.identify.model import Channel
-from sim2real.identify.segments import Span
+from sim2real.identification import held_out
+from sim2real.identification.fit import fit, refine, refit
+from sim2real.identification.held_out import REFITS, Fold, Refits, folds_of, leave_out, moving
+from sim2real.identification.model import Channel
+from sim2real.identification.segments import Span
 
 
 @pytest.fixture(scope="module")

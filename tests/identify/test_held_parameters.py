@@ -8,9 +8,9 @@ import pytest
 from lag import CONFIG as FAST
 from lag import GAIN, LENGTH_S, Model, Params, lag_log, spans
 
-from sim2real.identify import fit as fitting
-from sim2real.identify.fit import fit
-from sim2real.identify.parameters import Parameter, ParameterTable
+from sim2real.identification import fit as fitting
+from sim2real.identification.fit import fit
+from sim2real.identification.parameters import Parameter, ParameterTable
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.identify.fitting import Fits, determined
 from sim2real.stages.identify.judgement import Findings

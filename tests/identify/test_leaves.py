@@ -9,7 +9,7 @@ from flax import struct
 from mujoco import mjx
 
 from sim2real.errors import UsageError
-from sim2real.identify.parameter_paths import get_leaf, set_leaf
+from sim2real.identification.parameter_paths import get_leaf, set_leaf
 
 ARM = """
 <mujoco>

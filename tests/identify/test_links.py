@@ -8,8 +8,8 @@ from scipy.signal import lfilter
 
 from sim2real.artifacts.identification import Identification, Judgement, Link, Ranged
 from sim2real.errors import UsageError
-from sim2real.identify.delay_likelihood import DelayEvidence
-from sim2real.identify.delays import _losses, find, links, lost_share, measured
+from sim2real.identification.delay_likelihood import DelayEvidence
+from sim2real.identification.delays import _losses, find, links, lost_share, measured
 from sim2real.stages.identify.show import show
 
 GAIN, RATE = 5.0, 8.0  # speed [rad/s] of a volt in the end, and how fast it gets there [1/s]

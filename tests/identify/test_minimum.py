@@ -4,10 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import sim2real
+from sim2real import minimise
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.identify import minimise
-from sim2real.identify.config import FitConfig
+from sim2real.identification.config import FitConfig
 
 FEW = FitConfig(population=16, generations=60)
 START = {"mass": 1.0, "offset": np.zeros(2)}
@@ -19,13 +18,12 @@ def loss(p):
 
 
 def test_a_minimum_inside_of_bounds_is_found():
-    found = sim2real.identify.minimise(loss, START, BOUNDS, FEW)
+    found = minimise(loss, START, BOUNDS, FEW)
     assert found.parameters["mass"] == pytest.approx(0.01, rel=0.05)
     np.testing.assert_allclose(found.parameters["offset"], [0.5, -1.5], atol=0.05)
     assert found.loss < 1e-2 < found.start
     assert float(loss(found.parameters)) == pytest.approx(found.loss, abs=1e-5)
     assert repr(found).startswith("Minimum(loss: ")
-    assert sim2real.identify.minimise is minimise
 
 
 def test_a_loss_in_plain_python():

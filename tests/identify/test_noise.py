@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sim2real.artifacts.identification import Noise
-from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.identify.uncertainty import Linearised, above_noise, noises, widening
+from sim2real.identification.parameters import Parameter, ParameterTable
+from sim2real.identification.uncertainty import Linearised, above_noise, noises, widening
 
 QUANTUM, DEVIATION, BIAS = 0.0015, 0.004, 0.003
 SEGMENTS, LENGTH = 60, 80

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from sim2real.errors import UsageError
-from sim2real.identify.parameters import Parameter, ParameterTable
+from sim2real.identification.parameters import Parameter, ParameterTable
 
 INVERSE = {
     "linear": lambda x: x,

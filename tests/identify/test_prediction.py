@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sim2real.identify.model import Channel
-from sim2real.identify.predictions import errors, free_runs, labels
+from sim2real.identification.model import Channel
+from sim2real.identification.predictions import errors, free_runs, labels
 
 SETTLE_S = 0.2
 

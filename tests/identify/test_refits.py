@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sim2real.artifacts.identification import TriedTerm
-from sim2real.identify.held_out import REFITS, Refits
+from sim2real.identification.held_out import REFITS, Refits
 from sim2real.stages.identify.inputs import prepare
 from sim2real.stages.pipeline.open_log import open_recording
 from sim2real.stages.pipeline.pipeline import load_pipeline

@@ -6,11 +6,11 @@ from lag import BIAS, CONFIG, GAIN, NOISE, PERIOD_S, TAU_S, TRUE, Lag, Model, la
 from scipy.optimize import least_squares
 
 from sim2real.artifacts.identification import Noise
-from sim2real.identify import predictions
-from sim2real.identify.problem import Problem
-from sim2real.identify.residuals import Groups, corrected, robust
-from sim2real.identify.rollouts import Program
-from sim2real.identify.segments import Span
+from sim2real.identification import predictions
+from sim2real.identification.problem import Problem
+from sim2real.identification.residuals import Groups, corrected, robust
+from sim2real.identification.rollouts import Program
+from sim2real.identification.segments import Span
 from sim2real.stages.deploy.replay import _of_noise
 
 LENGTH_S, SPLIT_S = 0.93, 0.4

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.identify.config import FitConfig
-from sim2real.identify.search import search, strategies
+from sim2real.identification.config import FitConfig
+from sim2real.identification.search import search, strategies
 
 BOTTOM = np.array([1.0, -2.0])
 BOX = np.zeros(2), np.full(2, -8.0), np.full(2, 8.0)

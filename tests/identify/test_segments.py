@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sim2real.graph.episode import Episode, Steps
-from sim2real.identify.model import Channel
-from sim2real.identify.segments import Span, beyond, ranges
+from sim2real.identification.model import Channel
+from sim2real.identification.segments import Span, beyond, ranges
 
 MODEL = SimpleNamespace(
     sensor="sensor", given={"actuator": {"goal": "goal", "kp": "kp"}}, channels=(Channel("position", None, 0.01, 0.1),)

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim2real.identify.segments import padded, rounded
+from sim2real.identification.segments import padded, rounded
 
 counts, steps = st.integers(1, 10**6), st.sampled_from([1, 2, 4, 8])
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from lag import BIAS, CONFIG, LENGTH_S, Model, lag_log, spans
 
-from sim2real.identify.fit import fit
-from sim2real.identify.held_out import Refits, folds_of
-from sim2real.identify.terms import Selection, TermSearch, Trial, gains
+from sim2real.identification.fit import fit
+from sim2real.identification.held_out import Refits, folds_of
+from sim2real.identification.terms import Selection, TermSearch, Trial, gains
 
 
 @pytest.fixture(scope="module")

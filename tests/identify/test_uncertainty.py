@@ -6,11 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sim2real.identify import uncertainty
-from sim2real.identify.model import Channel
-from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.identify.residuals import Linearised
-from sim2real.identify.uncertainty import determined, from_linearised
+from sim2real.identification import uncertainty
+from sim2real.identification.model import Channel
+from sim2real.identification.parameters import Parameter, ParameterTable
+from sim2real.identification.residuals import Linearised
+from sim2real.identification.uncertainty import determined, from_linearised
 
 WIDE = 1e4
 

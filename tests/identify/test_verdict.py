@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from sim2real.artifacts.identification import Determined, Prediction
-from sim2real.identify import verdict
-from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.identify.predictions import Position
-from sim2real.identify.verdict import scores
+from sim2real.identification import verdict
+from sim2real.identification.parameters import Parameter, ParameterTable
+from sim2real.identification.predictions import Position
+from sim2real.identification.verdict import scores
 
 DELAYS = ("sensor_delay", "actuator_delay")
 TABLE = ParameterTable(

@@ -12,8 +12,8 @@ import pytest
 from sim2real.graph.base import GraphState
 from sim2real.graph.episode import Episode, Steps
 from sim2real.graph.schedule import draw
-from sim2real.identify.parameter_paths import get_leaf
-from sim2real.identify.predictions import samples
+from sim2real.identification.parameter_paths import get_leaf
+from sim2real.identification.predictions import samples
 from sim2real.log.importing.importer import import_file
 from sim2real.log.importing.mapping import load_mapping
 from sim2real.runtime.compiled.graph import CompiledGraph

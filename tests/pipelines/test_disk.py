@@ -9,9 +9,9 @@ import pytest
 from recorded_robots import RecordedRobotConformance, episode, predictions, public, rmse
 from scipy.optimize import least_squares
 
-from sim2real.identify.fit import fit
-from sim2real.identify.problem import Problem
-from sim2real.identify.segments import Span
+from sim2real.identification.fit import fit
+from sim2real.identification.problem import Problem
+from sim2real.identification.segments import Span
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 PIPELINE = load_pipeline("disk")

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim2real.identify.problem import Problem
-from sim2real.identify.segments import Span
+from sim2real.identification.problem import Problem
+from sim2real.identification.segments import Span
 from sim2real.log.reader import read_log
 from sim2real.robots.loop import BURST
 from sim2real.stages.pipeline.pipeline import load_pipeline

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from recorded_robots import RecordedRobotConformance, episode, predictions, public, rmse
 
-from sim2real.identify.problem import Problem
-from sim2real.identify.segments import Span
+from sim2real.identification.problem import Problem
+from sim2real.identification.segments import Span
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 PIPELINE = load_pipeline("so101_log")

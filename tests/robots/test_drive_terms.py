@@ -11,10 +11,10 @@ import pytest
 
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode, Steps
-from sim2real.identify.config import FitConfig
-from sim2real.identify.fit import refine
-from sim2real.identify.problem import Problem
-from sim2real.identify.segments import Span
+from sim2real.identification.config import FitConfig
+from sim2real.identification.fit import refine
+from sim2real.identification.problem import Problem
+from sim2real.identification.segments import Span
 from sim2real.robots.model.drives import driven
 from sim2real.robots.model.parameters import (
     LIMITS,

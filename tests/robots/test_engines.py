@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from small_robot import SERVOS, SHEET, VALUES, PairRobot
 
 from sim2real.graph.episode import Episode, Steps
-from sim2real.identify.config import FitConfig
-from sim2real.identify.problem import Problem
-from sim2real.identify.segments import Span
+from sim2real.identification.config import FitConfig
+from sim2real.identification.problem import Problem
+from sim2real.identification.segments import Span
 
 pytestmark = pytest.mark.night  # `make test` compares the engines in test_drive_terms.py
 MAX_DELAY_S, SEGMENT_S = 0.03, 0.4

@@ -7,9 +7,9 @@ import pytest
 from small_robot import VALUES
 from test_engines import MAX_DELAY_S, SEGMENT_S, converged_robot, pair_log
 
-from sim2real.identify.config import FitConfig
-from sim2real.identify.problem import Problem
-from sim2real.identify.segments import Span
+from sim2real.identification.config import FitConfig
+from sim2real.identification.problem import Problem
+from sim2real.identification.segments import Span
 
 pytestmark = pytest.mark.night  # MJX compiles for two minutes
 

@@ -14,13 +14,13 @@ from sim2real.artifacts.posterior import Posterior
 from sim2real.graph.base import Base
 from sim2real.graph.episode import Episode, Steps
 from sim2real.graph.node import BaseNode
-from sim2real.identify.config import FitConfig
-from sim2real.identify.export.mjcf import Late, late_mjcf
-from sim2real.identify.export.terms import find_terms
-from sim2real.identify.model import Channel
-from sim2real.identify.parameters import Parameter
-from sim2real.identify.problem import Problem
-from sim2real.identify.segments import Span
+from sim2real.identification.config import FitConfig
+from sim2real.identification.export.mjcf import Late, late_mjcf
+from sim2real.identification.export.terms import find_terms
+from sim2real.identification.model import Channel
+from sim2real.identification.parameters import Parameter
+from sim2real.identification.problem import Problem
+from sim2real.identification.segments import Span
 from sim2real.robots.identified import LoggedRobot
 from sim2real.worlds.mjx import MjxWorld
 from sim2real.worlds.recorded import RecordedActuator, command_delay

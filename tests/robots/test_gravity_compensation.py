@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from recorded_on_c import play
 
-from sim2real.identify import held_out, terms
-from sim2real.identify import problem as problems
-from sim2real.identify.fit import fit
-from sim2real.identify.held_out import Refits, folds_of
-from sim2real.identify.segments import Span
-from sim2real.identify.terms import TermSearch
+from sim2real.identification import held_out, terms
+from sim2real.identification import problem as problems
+from sim2real.identification.fit import fit
+from sim2real.identification.held_out import Refits, folds_of
+from sim2real.identification.segments import Span
+from sim2real.identification.terms import TermSearch
 from sim2real.robots.model.parameters import ParameterPattern
 from sim2real.robots.model.robot import MjcfRobot, RobotConfig
 from sim2real.stages.config import IdentifyConfig

@@ -7,9 +7,9 @@ import pytest
 from small_robot import VALUES, play_on_c
 
 from sim2real.graph.episode import Episode, Steps
-from sim2real.identify.config import FitConfig
-from sim2real.identify.problem import Problem
-from sim2real.identify.segments import Span
+from sim2real.identification.config import FitConfig
+from sim2real.identification.problem import Problem
+from sim2real.identification.segments import Span
 
 MAX_DELAY_S, PERIOD_S, SEGMENT_S = 0.03, 0.02, 0.6
 SENSOR_DELAY_S = 0.004

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from recorded_on_c import play
 
-from sim2real.identify.segments import Span
+from sim2real.identification.segments import Span
 from sim2real.robots.model.parameters import ParameterPattern
 from sim2real.robots.model.robot import MjcfRobot, RobotConfig
 from sim2real.stages.config import IdentifyConfig

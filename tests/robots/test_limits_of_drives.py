@@ -8,12 +8,12 @@ import pytest
 from recorded_on_c import play
 
 from sim2real.artifacts.identification import Estimate, Identification, Judgement
-from sim2real.identify.config import FitConfig
-from sim2real.identify.fit import fit
-from sim2real.identify.held_out import folds_of
-from sim2real.identify.segments import Span
-from sim2real.identify.terms import TermSearch
-from sim2real.identify.uncertainty import NOT_REACHED
+from sim2real.identification.config import FitConfig
+from sim2real.identification.fit import fit
+from sim2real.identification.held_out import folds_of
+from sim2real.identification.segments import Span
+from sim2real.identification.terms import TermSearch
+from sim2real.identification.uncertainty import NOT_REACHED
 from sim2real.robots.model.parameters import ParameterPattern
 from sim2real.robots.model.robot import MjcfRobot, RobotConfig
 from sim2real.stages.identify.judgement import Findings

@@ -10,7 +10,7 @@ from sim2real.graph.base import GraphState
 from sim2real.graph.node import BaseWorld
 from sim2real.graph.schedule import derive, draw
 from sim2real.graph.windows import bursty_episodes, make_room, newest_message
-from sim2real.identify.parameters import ParameterTable
+from sim2real.identification.parameters import ParameterTable
 from sim2real.robots.loop import (
     BURST,
     DELAYS,

@@ -15,11 +15,11 @@ from sim2real import cli, errors
 from sim2real.artifacts.identification import Estimate, Identification, Judgement, Link, Ranged
 from sim2real.artifacts.posterior import Posterior
 from sim2real.graph.episode import Episode, Steps
-from sim2real.identify import predictions as prediction
-from sim2real.identify.config import FitConfig
-from sim2real.identify.predictions import replays
-from sim2real.identify.problem import Problem
-from sim2real.identify.segments import Span
+from sim2real.identification import predictions as prediction
+from sim2real.identification.config import FitConfig
+from sim2real.identification.predictions import replays
+from sim2real.identification.problem import Problem
+from sim2real.identification.segments import Span
 from sim2real.log import read_log
 from sim2real.robots.model.parameters import ParameterPattern
 from sim2real.robots.model.robot import MjcfRobot, RobotConfig

@@ -12,8 +12,8 @@ from sim2real.emulation.truth import Kind, read_truth
 from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.joint import Joint
 from sim2real.hardware.safety.limits import GateLimits
-from sim2real.identify.fit import fit
-from sim2real.identify.segments import Span
+from sim2real.identification.fit import fit
+from sim2real.identification.segments import Span
 from sim2real.log.reader import read_log
 from sim2real.stages.config import RecordConfig
 from sim2real.stages.excitation.signals import excitation

@@ -11,7 +11,7 @@ from small_robot import SERVOS, SHEET, VALUES, PairRobot, play_in_a_graph, play_
 
 from sim2real.errors import UsageError
 from sim2real.hardware.joint import Joint
-from sim2real.identify.rollouts import choose_engine
+from sim2real.identification.rollouts import choose_engine
 from sim2real.robots.messages import EpisodeStart
 from sim2real.robots.servo.model import ServoModel, servo_parameters
 from sim2real.stages.pipeline.pipeline import load_pipeline

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from recorded_on_c import play
 
-from sim2real.identify.config import FitConfig
-from sim2real.identify.fit import fit, refine
-from sim2real.identify.segments import Span
+from sim2real.identification.config import FitConfig
+from sim2real.identification.fit import fit, refine
+from sim2real.identification.segments import Span
 from sim2real.robots.model.parameters import ParameterPattern, like_joints, sharing, usual_patterns
 from sim2real.robots.model.robot import MjcfRobot, RobotConfig
 from sim2real.stages.shared.identification import offering, with_wanted_terms

@@ -15,10 +15,10 @@ from pipelines.go2.robot import ROBOT
 from sim2real.artifacts.recording import Recording
 from sim2real.emulation.truth import read_truth
 from sim2real.errors import OtherMotion
-from sim2real.identify.config import FitConfig
-from sim2real.identify.predictions import labels
-from sim2real.identify.problem import Problem
-from sim2real.identify.segments import Span
+from sim2real.identification.config import FitConfig
+from sim2real.identification.predictions import labels
+from sim2real.identification.problem import Problem
+from sim2real.identification.segments import Span
 from sim2real.robots.walking.twin import twin_of
 from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.stages.shared.identification import spans

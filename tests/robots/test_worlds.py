@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sim2real.errors import UsageError
-from sim2real.identify.parameters import Parameter
+from sim2real.identification.parameters import Parameter
 from sim2real.robots.robot import RecordedRobot, RobotModel, checked, in_world
 from sim2real.stages.pipeline.pipeline import load_pipeline
 

@@ -13,7 +13,7 @@ from sim2real.artifacts.identification import Estimate, Identification, Judgemen
 from sim2real.artifacts.posterior import Posterior
 from sim2real.artifacts.run import run_folder
 from sim2real.commands.export import find_parameters
-from sim2real.identify.export import terms
+from sim2real.identification.export import terms
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 

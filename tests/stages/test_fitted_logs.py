@@ -10,7 +10,7 @@ from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run.run_folder import Source
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
-from sim2real.identify.model import Channel
+from sim2real.identification.model import Channel
 from sim2real.stages.shared.identification import require_apart, require_new
 
 CHANNELS = (

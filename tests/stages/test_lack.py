@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sim2real.artifacts.identification import FreeRun, Identification, Judgement, Noise, TriedTerm
-from sim2real.identify.held_out import Refits
-from sim2real.identify.verdict import Position
+from sim2real.identification.held_out import Refits
+from sim2real.identification.verdict import Position
 from sim2real.stages.identify import judgement
 from sim2real.stages.identify.judgement import farthest_run, lack, largest_residual
 

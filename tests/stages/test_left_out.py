@@ -8,10 +8,10 @@ from scipy import stats
 
 from sim2real.artifacts.identification import HeldOutPart
 from sim2real.errors import UsageError
-from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.identify.predictions import Position
-from sim2real.identify.residuals import Linearised
-from sim2real.identify.uncertainty import Uncertainty
+from sim2real.identification.parameters import Parameter, ParameterTable
+from sim2real.identification.predictions import Position
+from sim2real.identification.residuals import Linearised
+from sim2real.identification.uncertainty import Uncertainty
 from sim2real.stages.config import IdentifyConfig
 from sim2real.stages.identify import fitting
 from sim2real.stages.identify.fitting import widened

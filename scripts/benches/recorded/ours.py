@@ -15,12 +15,12 @@ import numpy as np
 from benches.recorded.sets import BEFORE, DISK_BLOCK, DISK_BLOCKS, Fold, Recording, load
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
-from sim2real.identify import predictions as prediction
-from sim2real.identify.fit import Fit as ModelFit
-from sim2real.identify.fit import as_numbers
-from sim2real.identify.fit import fit as fit_model
-from sim2real.identify.problem import Problem
-from sim2real.identify.segments import Span
+from sim2real.identification import predictions as prediction
+from sim2real.identification.fit import Fit as ModelFit
+from sim2real.identification.fit import as_numbers
+from sim2real.identification.fit import fit as fit_model
+from sim2real.identification.problem import Problem
+from sim2real.identification.segments import Span
 from sim2real.stages.config import IdentifyConfig
 from sim2real.stages.identify import fitting
 from sim2real.stages.pipeline import from_model

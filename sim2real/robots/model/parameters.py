@@ -12,7 +12,7 @@ import numpy as np
 
 from sim2real.arrays import beside_damping
 from sim2real.errors import UsageError
-from sim2real.identify.parameters import Parameter
+from sim2real.identification.parameters import Parameter
 from sim2real.robots.model.drives import force_of, gains_of, limit_of, slides_of, unit_for
 from sim2real.types import Array, MjModel, PyTree, Scalar
 from sim2real.worlds.drive_terms import NO_LIMIT

@@ -18,8 +18,8 @@ from sim2real.artifacts.files import check
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.episode import Episode
 from sim2real.graph.node import BaseNode
-from sim2real.identify.model import Channel, PlainSimulation
-from sim2real.identify.parameters import Parameter, ParameterTable
+from sim2real.identification.model import Channel, PlainSimulation
+from sim2real.identification.parameters import Parameter, ParameterTable
 from sim2real.log.importing.mapping import toml_value
 from sim2real.robots.identified import IdentifiableRecording, LoggedRobot
 from sim2real.robots.loop import ACTUATOR, SENSOR
@@ -328,7 +328,7 @@ class MjcfRobot(LoggedRobot):
 
 
 class IdentifiableMjcf(IdentifiableRecording):
-    """Simulates what the encoders measured; an ``identify.model.IdentifiableModel``.
+    """Simulates what the encoders measured; an ``identification.model.IdentifiableModel``.
 
     Encoders are read a tick later than recorded, and interpolate a tick back: nothing shifts.
 
@@ -356,7 +356,7 @@ class IdentifiableMjcf(IdentifiableRecording):
         return {p.parameter.name: float(most[p.what][list(p.at)].max()) for p in limits}
 
     def loaded(self, params: dict[str, PyTree], first: Mapping[str, PyTree]) -> dict[str, PyTree]:
-        """Return node parameters with the payload of a log's first command; see ``identify.model.CarriesPayload``."""
+        """Return node parameters with the payload of a log's first command."""
         command = first[ACTUATOR]
         return {**params, "world": self._world.holding(params["world"], command)}
 

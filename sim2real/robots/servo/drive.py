@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sim2real.identify.model import Channel
+from sim2real.identification.model import Channel
 from sim2real.robots.loop import ACTUATOR
 from sim2real.robots.messages import Goals, JointReading
 from sim2real.robots.probe import Probe

@@ -18,8 +18,8 @@ import numpy as np
 
 from sim2real.arrays import beside_damping
 from sim2real.errors import UsageError
-from sim2real.identify.export.plain import PlainSimulation, converged
-from sim2real.identify.parameters import Parameter
+from sim2real.identification.export.plain import PlainSimulation, converged
+from sim2real.identification.parameters import Parameter
 from sim2real.later import jnp
 from sim2real.robots.messages import EpisodeStart
 from sim2real.robots.robot import RobotModel

@@ -13,7 +13,7 @@ import numpy as np
 
 from sim2real.artifacts.identification import Noise
 from sim2real.errors import SafetyStop, UsageError
-from sim2real.identify.model import Channel
+from sim2real.identification.model import Channel
 from sim2real.robots.robot import RobotDrive, RobotSensor
 from sim2real.robots.servo.drive import approached
 from sim2real.robots.session import Embedded, Session

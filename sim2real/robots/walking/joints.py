@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim2real.identify.parameters import Parameter
+from sim2real.identification.parameters import Parameter
 from sim2real.types import Array, PyTree, Scalar
 
 QUANTITIES = {

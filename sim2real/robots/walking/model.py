@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim2real.errors import UsageError
-from sim2real.identify.parameters import Parameter
+from sim2real.identification.parameters import Parameter
 from sim2real.robots.messages import EpisodeStart
 from sim2real.robots.robot import RobotModel
 from sim2real.robots.walking.joints import STRENGTH as MOTOR_STRENGTH

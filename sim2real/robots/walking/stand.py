@@ -14,8 +14,8 @@ from sim2real.errors import OtherMotion
 from sim2real.graph.base import GraphState, Value
 from sim2real.graph.episode import Episode
 from sim2real.graph.node import BaseNode
-from sim2real.identify.model import Channel
-from sim2real.identify.parameters import Parameter, ParameterTable
+from sim2real.identification.model import Channel
+from sim2real.identification.parameters import Parameter, ParameterTable
 from sim2real.robots.loop import ACTUATOR, SENSOR, WORLD, DelayParams, delay_of, delay_parameters, recorded_loop
 from sim2real.robots.model.drives import EncoderParams, Encoders, driven_spec
 from sim2real.robots.model.file import read_spec
@@ -34,7 +34,7 @@ _STILL_RAD_S, _LEVEL_RAD = 0.04, 0.01
 
 
 class LegsInAStand:
-    """Simulates what the encoders of legs in a stand measure; an ``identify.model.IdentifiableModel``.
+    """Simulates what the encoders of legs in a stand measure; an ``identification.model.IdentifiableModel``.
 
     Args:
         fixed: Parameters of training that the log of a stand replaces by others.

@@ -19,9 +19,9 @@ from sim2real.artifacts.run.run_folder import newest
 from sim2real.artifacts.summary import ArtifactTable, Shown
 from sim2real.errors import NotInstalled, Sim2RealError, UsageError
 from sim2real.graph.episode import Episode
-from sim2real.identify.model import Channel, IdentifiableModel, measured_channels, position_of
-from sim2real.identify.parameters import ParameterTable
-from sim2real.identify.segments import Span, check_log
+from sim2real.identification.model import Channel, IdentifiableModel, measured_channels, position_of
+from sim2real.identification.parameters import ParameterTable
+from sim2real.identification.segments import Span, check_log
 from sim2real.installation import has_jax
 from sim2real.log.importing.names import about_torque
 from sim2real.log.schema import unit_of
@@ -488,8 +488,8 @@ def determine(
     model: IdentifiableModel, episodes: Sequence[Episode], config: IdentifyConfig, parameters: ParameterTable
 ) -> Checked:
     """Return which parameters recordings determine: their residuals are simulated once, at the nominal values."""
-    from sim2real.identify.problem import Problem  # imports JAX
-    from sim2real.identify.uncertainty import determined as what_is_determined
+    from sim2real.identification.problem import Problem  # imports JAX
+    from sim2real.identification.uncertainty import determined as what_is_determined
 
     spans, length_s = cut_segments(episodes, config)
     problem = Problem(model, episodes, spans, length_s, config, parameters)

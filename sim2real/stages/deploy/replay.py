@@ -9,16 +9,16 @@ from sim2real.artifacts.deployment import AS_HERE, Drift, Replay
 from sim2real.artifacts.identification import UNFINISHED, Identification, Noise
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode
-from sim2real.identify import drift as drift_test
-from sim2real.identify import predictions as prediction
-from sim2real.identify.expected import expected_at
-from sim2real.identify.fit import refine
-from sim2real.identify.held_out import MOVES
-from sim2real.identify.model import ChecksLogs, IdentifiableModel
-from sim2real.identify.parameters import ParameterTable
-from sim2real.identify.predictions import NOISE, positions
-from sim2real.identify.problem import Problem
-from sim2real.identify.segments import Span
+from sim2real.identification import drift as drift_test
+from sim2real.identification import predictions as prediction
+from sim2real.identification.expected import expected_at
+from sim2real.identification.fit import refine
+from sim2real.identification.held_out import MOVES
+from sim2real.identification.model import ChecksLogs, IdentifiableModel
+from sim2real.identification.parameters import ParameterTable
+from sim2real.identification.predictions import NOISE, positions
+from sim2real.identification.problem import Problem
+from sim2real.identification.segments import Span
 from sim2real.robots.robot import RecordedRobot
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.pipeline.pipeline import Pipeline

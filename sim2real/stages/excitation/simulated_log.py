@@ -11,9 +11,9 @@ from sim2real.graph.episode import Episode, Steps, named_leaves
 from sim2real.graph.node import to_ticks
 from sim2real.graph.schedule import draw
 from sim2real.graph.times import Vertex
-from sim2real.identify.config import FitConfig
-from sim2real.identify.model import IdentifiableModel
-from sim2real.identify.rollouts import GraphOnC, choose_engine
+from sim2real.identification.config import FitConfig
+from sim2real.identification.model import IdentifiableModel
+from sim2real.identification.rollouts import GraphOnC, choose_engine
 from sim2real.robots.loop import ACTUATOR
 from sim2real.robots.robot import Robot
 from sim2real.runtime.compiled.open_loop import OpenLoopGraph

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from sim2real.errors import UsageError
-from sim2real.identify.config import FitConfig
+from sim2real.identification.config import FitConfig
 from sim2real.stages.flag import Flag
 from sim2real.stages.live.config import ViewFlag, check_view
 

@@ -8,16 +8,16 @@ import numpy as np
 
 from sim2real.artifacts.identification import Determined, HeldOutPart
 from sim2real.graph.episode import Episode
-from sim2real.identify.fit import Fit, OnProgress, as_numbers, fit
-from sim2real.identify.held_out import MOST, Fold, Refits, folds_of, leave_out
-from sim2real.identify.model import IdentifiableModel
-from sim2real.identify.parameters import ParameterTable
-from sim2real.identify.problem import Problem
-from sim2real.identify.residuals import Linearised
-from sim2real.identify.segments import Span
-from sim2real.identify.terms import Selection, TermSearch
-from sim2real.identify.uncertainty import ABSENT, NOT_REACHED, Uncertainty, between_parts
-from sim2real.identify.uncertainty import determined as what_is_determined
+from sim2real.identification.fit import Fit, OnProgress, as_numbers, fit
+from sim2real.identification.held_out import MOST, Fold, Refits, folds_of, leave_out
+from sim2real.identification.model import IdentifiableModel
+from sim2real.identification.parameters import ParameterTable
+from sim2real.identification.problem import Problem
+from sim2real.identification.residuals import Linearised
+from sim2real.identification.segments import Span
+from sim2real.identification.terms import Selection, TermSearch
+from sim2real.identification.uncertainty import ABSENT, NOT_REACHED, Uncertainty, between_parts
+from sim2real.identification.uncertainty import determined as what_is_determined
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.identify.inputs import Inputs
 from sim2real.stages.identify.progress import Best

@@ -14,11 +14,11 @@ from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run.run_folder import Source, portable
 from sim2real.errors import OtherMotion
 from sim2real.graph.episode import Episode
-from sim2real.identify.delays import measured
-from sim2real.identify.held_out import REFITS, Refits
-from sim2real.identify.model import IdentifiableModel, measured_channels
-from sim2real.identify.parameters import ParameterTable
-from sim2real.identify.segments import Span
+from sim2real.identification.delays import measured
+from sim2real.identification.held_out import REFITS, Refits
+from sim2real.identification.model import IdentifiableModel, measured_channels
+from sim2real.identification.parameters import ParameterTable
+from sim2real.identification.segments import Span
 from sim2real.robots.robot import RecordedRobot, Robot, in_world
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.pipeline.open_log import require_units

@@ -27,21 +27,28 @@ from sim2real.artifacts.identification import (
 )
 from sim2real.artifacts.posterior import Posterior
 from sim2real.graph.episode import Episode
-from sim2real.identify import predictions as prediction
-from sim2real.identify import verdict
-from sim2real.identify.delays import links
-from sim2real.identify.expected import wider_for, with_expected_errors
-from sim2real.identify.fit import Fit, Value, as_numbers, refine, refit
-from sim2real.identify.model import measured_channels
-from sim2real.identify.predictions import Position, positions, replays, worst_second
-from sim2real.identify.problem import Problem, few_of
-from sim2real.identify.residuals import Linearised
-from sim2real.identify.segments import Span, beyond, ranges
-from sim2real.identify.terms import TermSearch, gains
-from sim2real.identify.uncertainty import ABSENT, NOT_REACHED, Uncertainty, compare_recordings, from_linearised, noises
-from sim2real.identify.uncertainty import determined as what_is_determined
-from sim2real.identify.uncertainty import widening as posterior_widening
-from sim2real.identify.verdict import ACCEPTED, CHANGE, NO_DELAY, scores, state_of
+from sim2real.identification import predictions as prediction
+from sim2real.identification import verdict
+from sim2real.identification.delays import links
+from sim2real.identification.expected import wider_for, with_expected_errors
+from sim2real.identification.fit import Fit, Value, as_numbers, refine, refit
+from sim2real.identification.model import measured_channels
+from sim2real.identification.predictions import Position, positions, replays, worst_second
+from sim2real.identification.problem import Problem, few_of
+from sim2real.identification.residuals import Linearised
+from sim2real.identification.segments import Span, beyond, ranges
+from sim2real.identification.terms import TermSearch, gains
+from sim2real.identification.uncertainty import (
+    ABSENT,
+    NOT_REACHED,
+    Uncertainty,
+    compare_recordings,
+    from_linearised,
+    noises,
+)
+from sim2real.identification.uncertainty import determined as what_is_determined
+from sim2real.identification.uncertainty import widening as posterior_widening
+from sim2real.identification.verdict import ACCEPTED, CHANGE, NO_DELAY, scores, state_of
 from sim2real.robots.robot import in_world
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.identify.fitting import (

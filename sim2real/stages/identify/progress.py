@@ -17,10 +17,10 @@ import numpy as np
 from sim2real.artifacts.identification import Estimate, Identification, Judgement, Search
 from sim2real.artifacts.progress import write_best_fit, write_progress
 from sim2real.artifacts.run.run_folder import OpenStage
-from sim2real.identify.fit import as_numbers
-from sim2real.identify.parameters import ParameterTable
-from sim2real.identify.predictions import samples
-from sim2real.identify.problem import Problem
+from sim2real.identification.fit import as_numbers
+from sim2real.identification.parameters import ParameterTable
+from sim2real.identification.predictions import samples
+from sim2real.identification.problem import Problem
 from sim2real.stages.identify.inputs import Inputs
 from sim2real.stages.live.viewer import live_view
 from sim2real.stages.terminal.console import note, shown

@@ -12,8 +12,8 @@ from typing import Any
 from sim2real.artifacts.identification import PARAMETERS, Identification
 from sim2real.artifacts.run.run_folder import OpenStage, StageFolder, newest, open_stage
 from sim2real.errors import UsageError
-from sim2real.identify.held_out import REFITS
-from sim2real.identify.uncertainty import noises
+from sim2real.identification.held_out import REFITS
+from sim2real.identification.uncertainty import noises
 from sim2real.robots.robot import RecordedRobot, Robot
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.identify.fitting import fit_model

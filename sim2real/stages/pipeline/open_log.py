@@ -4,7 +4,7 @@ from pathlib import Path
 
 from sim2real.artifacts.recording import Recording
 from sim2real.errors import Sim2RealError
-from sim2real.identify.segments import require_moved
+from sim2real.identification.segments import require_moved
 from sim2real.log.importing.importer import import_file
 from sim2real.log.schema import unit_of
 from sim2real.robots.loop import ACTUATOR, SENSOR

@@ -19,9 +19,9 @@ from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run.manifest import sha256
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
-from sim2real.identify.model import IdentifiableModel, position_of
-from sim2real.identify.parameters import ParameterTable
-from sim2real.identify.segments import GRID_S, Span, on_grid
+from sim2real.identification.model import IdentifiableModel, position_of
+from sim2real.identification.parameters import ParameterTable
+from sim2real.identification.segments import GRID_S, Span, on_grid
 from sim2real.robots.robot import RecordedRobot, in_world
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.pipeline.pipeline import Pipeline

@@ -13,7 +13,7 @@ from sim2real.artifacts.posterior import TRANSFORMS, Posterior, from_scale
 from sim2real.artifacts.sensitivity import Moved, Sensitivity
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import UsageError
-from sim2real.identify.rollouts import Program
+from sim2real.identification.rollouts import Program
 from sim2real.robots.loop import DELAYS, LoopTask, split_delay
 from sim2real.robots.robot import Robot
 from sim2real.stages.pipeline.pipeline import Pipeline

@@ -23,14 +23,14 @@ from sim2real.artifacts.identification import (
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.summary import ArtifactTable, Shown
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.identify import predictions as prediction
-from sim2real.identify.expected import wider_for
-from sim2real.identify.held_out import moving
-from sim2real.identify.model import IdentifiableModel, measured_channels
-from sim2real.identify.predictions import Position, positions
-from sim2real.identify.problem import Problem
-from sim2real.identify.segments import Span, check_log, ranges
-from sim2real.identify.verdict import ACCEPTED, scores
+from sim2real.identification import predictions as prediction
+from sim2real.identification.expected import wider_for
+from sim2real.identification.held_out import moving
+from sim2real.identification.model import IdentifiableModel, measured_channels
+from sim2real.identification.predictions import Position, positions
+from sim2real.identification.problem import Problem
+from sim2real.identification.segments import Span, check_log, ranges
+from sim2real.identification.verdict import ACCEPTED, scores
 from sim2real.robots.robot import Robot
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.pipeline import python_arguments

@@ -8,7 +8,7 @@ from flax import struct
 
 from sim2real.graph.base import GraphState
 from sim2real.graph.node import BaseNode
-from sim2real.identify.parameters import Parameter
+from sim2real.identification.parameters import Parameter
 from sim2real.robots.messages import EpisodeStart
 from sim2real.robots.robot import Robot, RobotModel
 from sim2real.worlds.joint import Forces

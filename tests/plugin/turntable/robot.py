@@ -10,8 +10,8 @@ import numpy as np
 from flax import struct
 
 from sim2real.graph.base import Base, GraphState
-from sim2real.identify.model import Channel
-from sim2real.identify.parameters import Parameter
+from sim2real.identification.model import Channel
+from sim2real.identification.parameters import Parameter
 from sim2real.policy.contract import ActionTerm, ObservationTerm
 from sim2real.robots.agent import AgentParams, GoalAgent
 from sim2real.robots.loop import delay_of

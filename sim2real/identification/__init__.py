@@ -5,10 +5,10 @@
     import numpy as np
 
     import sim2real
-    from sim2real.identify import predictions, uncertainty, verdict
-    from sim2real.identify.config import FitConfig
-    from sim2real.identify.fit import fit
-    from sim2real.identify.segments import Span
+    from sim2real.identification import predictions, uncertainty, verdict
+    from sim2real.identification.config import FitConfig
+    from sim2real.identification.fit import fit
+    from sim2real.identification.segments import Span
 
     LENGTH_S, SETTLE_S, HORIZON_S = 1.3, 0.3, 1.0
 
@@ -46,23 +46,3 @@
 In the order of the data: ``segments``, ``rollouts``, ``residuals``, ``problem``, ``search``, ``fit``, ``uncertainty``,
 ``predictions``, ``held_out``, ``terms``, ``expected``, ``verdict``; beside it ``delays``, ``drift``, ``export``.
 """
-
-from typing import TYPE_CHECKING
-
-from sim2real import callable_package
-
-if TYPE_CHECKING:
-    from sim2real.identify.search import minimise as minimise
-
-__all__ = ["minimise"]
-
-callable_package(__name__)
-
-
-def __getattr__(name: str) -> object:
-    """Import a public function on first use."""
-    if name in __all__:
-        from sim2real.identify import search
-
-        return getattr(search, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

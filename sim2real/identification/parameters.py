@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from sim2real.artifacts.posterior import TRANSFORMS, Posterior, Transform, from_scale
 from sim2real.errors import UsageError
-from sim2real.identify.parameter_paths import set_leaf
+from sim2real.identification.parameter_paths import set_leaf
 from sim2real.later import jax, jnp
 from sim2real.types import Array, PyTree
 

@@ -10,10 +10,10 @@ from sim2real.artifacts.deployment import Changed, Drift
 from sim2real.artifacts.identification import ROUND_TRIP
 from sim2real.artifacts.posterior import Posterior, Transform
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.identify.parameters import ParameterTable
-from sim2real.identify.problem import Problem
-from sim2real.identify.residuals import Linearised
-from sim2real.identify.uncertainty import loss_variance
+from sim2real.identification.parameters import ParameterTable
+from sim2real.identification.problem import Problem
+from sim2real.identification.residuals import Linearised
+from sim2real.identification.uncertainty import loss_variance
 
 LEVEL = 0.05
 """False-alarm rate of the drift test, per log."""

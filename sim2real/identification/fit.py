@@ -14,14 +14,14 @@ import numpy as np
 from sim2real.artifacts.identification import Refinement, Search
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode
-from sim2real.identify.config import FitConfig
-from sim2real.identify.model import IdentifiableModel
-from sim2real.identify.parameters import ParameterTable
-from sim2real.identify.problem import MOST_OF_FIT, Problem, few_of, of_recordings, thinned
-from sim2real.identify.residuals import Part, robust
-from sim2real.identify.search import SearchResult, search
-from sim2real.identify.segments import Span
-from sim2real.identify.uncertainty import (
+from sim2real.identification.config import FitConfig
+from sim2real.identification.model import IdentifiableModel
+from sim2real.identification.parameters import ParameterTable
+from sim2real.identification.problem import MOST_OF_FIT, Problem, few_of, of_recordings, thinned
+from sim2real.identification.residuals import Part, robust
+from sim2real.identification.search import SearchResult, search
+from sim2real.identification.segments import Span
+from sim2real.identification.uncertainty import (
     Uncertainty,
     deviation,
     from_linearised,

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim2real.identify.delay_likelihood import FLOOR, DelayEvidence, Likelihood, along, covariance, maximise
+from sim2real.identification.delay_likelihood import FLOOR, DelayEvidence, Likelihood, along, covariance, maximise
 
 _FIRST_S = 0.005
 """Assumed deviation of delays before the first estimate [s]."""

@@ -16,7 +16,7 @@ import numpy as np
 from sim2real.artifacts.identification import Search
 from sim2real.artifacts.summary import ArtifactTable, Shown
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.identify.config import FitConfig
+from sim2real.identification.config import FitConfig
 from sim2real.types import Array, PyTree
 
 Losses = Callable[[np.ndarray, np.ndarray, bool], np.ndarray]

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from sim2real.artifacts.identification import Identification
-from sim2real.identify.export.terms import Delays, Terms
+from sim2real.identification.export.terms import Delays, Terms
 
 FORMAT = 1
 _COLUMNS = (

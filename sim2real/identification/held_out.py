@@ -21,12 +21,12 @@ import numpy as np
 from sim2real.artifacts.files import read_json, write_json
 from sim2real.artifacts.identification import HeldOutPart, TriedTerm
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.identify.fit import Fit, refine, with_terms
-from sim2real.identify.parameters import ParameterTable
-from sim2real.identify.predictions import labels
-from sim2real.identify.problem import Problem
-from sim2real.identify.residuals import Linearised, Part
-from sim2real.identify.segments import Span, on_grid
+from sim2real.identification.fit import Fit, refine, with_terms
+from sim2real.identification.parameters import ParameterTable
+from sim2real.identification.predictions import labels
+from sim2real.identification.problem import Problem
+from sim2real.identification.residuals import Linearised, Part
+from sim2real.identification.segments import Span, on_grid
 
 REFITS = "refits.json"
 """File of finished refits."""

@@ -18,15 +18,15 @@ import numpy as np
 from sim2real.artifacts.files import make_folder, write_arrays, write_json
 from sim2real.artifacts.identification import ROUND_TRIP
 from sim2real.artifacts.posterior import TRANSFORMS
-from sim2real.identify.export.document import json_document
-from sim2real.identify.export.plain import PlainSimulation
-from sim2real.identify.export.reproduce import Card
-from sim2real.identify.model import IdentifiableModel
+from sim2real.identification.export.document import json_document
+from sim2real.identification.export.plain import PlainSimulation
+from sim2real.identification.export.reproduce import Card
+from sim2real.identification.model import IdentifiableModel
 from sim2real.types import Json
 
 if TYPE_CHECKING:
     from sim2real.artifacts.identification import Estimate, Identification
-    from sim2real.identify.export.terms import Delays, Terms
+    from sim2real.identification.export.terms import Delays, Terms
 
 CARD, MODEL, SIGNALS, SCRIPT = "card.json", "model.xml", "signals.npz", "reproduce.py"
 ALLOWED = 0.01

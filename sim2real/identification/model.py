@@ -10,8 +10,8 @@ import numpy as np
 
 from sim2real.graph.episode import Episode
 from sim2real.graph.node import BaseNode
-from sim2real.identify.export.plain import PlainSimulation as PlainSimulation
-from sim2real.identify.parameters import ParameterTable
+from sim2real.identification.export.plain import PlainSimulation as PlainSimulation
+from sim2real.identification.parameters import ParameterTable
 from sim2real.later import jax
 from sim2real.types import Array, PyTree
 

@@ -7,9 +7,9 @@ from typing import Literal
 import numpy as np
 
 from sim2real.artifacts.identification import Determined, HeldOut, Judgement, Prediction
-from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.identify.predictions import NOISE, Position
-from sim2real.identify.uncertainty import ABSENT, BOUND, NOT_REACHED, OK, Uncertainty
+from sim2real.identification.parameters import Parameter, ParameterTable
+from sim2real.identification.predictions import NOISE, Position
+from sim2real.identification.uncertainty import ABSENT, BOUND, NOT_REACHED, OK, Uncertainty
 
 Status = Literal["accepted", "record again", "change the model", "not finished"]
 ACCEPTED: Status = "accepted"

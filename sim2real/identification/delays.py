@@ -11,10 +11,10 @@ import numpy as np
 
 from sim2real.artifacts.identification import Link, Ranged
 from sim2real.errors import UsageError
-from sim2real.identify.delay_likelihood import DelayEvidence, Likelihood
-from sim2real.identify.hidden_delays import Hidden, Linearise, hidden
-from sim2real.identify.parameters import ParameterTable
-from sim2real.identify.problem import Problem
+from sim2real.identification.delay_likelihood import DelayEvidence, Likelihood
+from sim2real.identification.hidden_delays import Hidden, Linearise, hidden
+from sim2real.identification.parameters import ParameterTable
+from sim2real.identification.problem import Problem
 
 _STEP_S = 0.001
 """Distance of the delays at which the motion is predicted [s]."""

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 
 from sim2real.artifacts.identification import FreeRun, Prediction, WorstSecond, worst_window
 from sim2real.graph.node import TICKS_PER_S
-from sim2real.identify.model import IdentifiableModel, position_of
-from sim2real.identify.problem import Problem
+from sim2real.identification.model import IdentifiableModel, position_of
+from sim2real.identification.problem import Problem
 from sim2real.log.schema import unit_of
 
 GOAL = "told"

@@ -14,7 +14,7 @@ from sim2real.graph.episode import Episode
 from sim2real.graph.node import TICKS_PER_S, BaseNode, to_ticks
 from sim2real.graph.timeline import Timeline
 from sim2real.graph.times import Edge, Vertex
-from sim2real.identify.model import ChecksLogs, IdentifiableModel
+from sim2real.identification.model import ChecksLogs, IdentifiableModel
 from sim2real.later import jnp
 from sim2real.types import Array, PyTree
 

@@ -13,13 +13,13 @@ from itertools import combinations
 import numpy as np
 
 from sim2real.artifacts.identification import HeldOutPart, Outcome, TriedTerm
-from sim2real.identify import held_out
-from sim2real.identify.fit import Fit, refine, with_terms
-from sim2real.identify.held_out import Fold, Refits, Statistics, on_held_out_parts, statistics
-from sim2real.identify.parameters import ParameterTable
-from sim2real.identify.predictions import labels
-from sim2real.identify.problem import MOST_OF_SETS, thinned
-from sim2real.identify.uncertainty import above_noise
+from sim2real.identification import held_out
+from sim2real.identification.fit import Fit, refine, with_terms
+from sim2real.identification.held_out import Fold, Refits, Statistics, on_held_out_parts, statistics
+from sim2real.identification.parameters import ParameterTable
+from sim2real.identification.predictions import labels
+from sim2real.identification.problem import MOST_OF_SETS, thinned
+from sim2real.identification.uncertainty import above_noise
 
 ALIKE = 1.1
 """Largest ratio of two errors that count as equal."""

@@ -18,10 +18,10 @@ import numpy as np
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState
 from sim2real.graph.node import BaseNode, BaseWorld
-from sim2real.identify.config import FitConfig
-from sim2real.identify.model import CarriesPayload, IdentifiableModel
-from sim2real.identify.parameters import ParameterTable
-from sim2real.identify.segments import Data, padded
+from sim2real.identification.config import FitConfig
+from sim2real.identification.model import CarriesPayload, IdentifiableModel
+from sim2real.identification.parameters import ParameterTable
+from sim2real.identification.segments import Data, padded
 from sim2real.runtime.compiled.open_loop import OpenLoopGraph, Tables
 from sim2real.types import Array, MjModel, PyTree, Scalar
 from sim2real.worlds import rollouts as physics

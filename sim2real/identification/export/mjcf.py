@@ -8,7 +8,7 @@ from typing import Any
 import mujoco
 
 from sim2real.errors import UsageError
-from sim2real.identify.export.terms import Term, Terms
+from sim2real.identification.export.terms import Term, Terms
 
 _mj: Any = mujoco
 _LINEAR = 1

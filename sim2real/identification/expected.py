@@ -20,9 +20,9 @@ from sim2real.artifacts.identification import (
     HeldOutPart,
     Identification,
 )
-from sim2real.identify.held_out import MOVES
-from sim2real.identify.predictions import NOISE, Position
-from sim2real.identify.segments import Signal, range_of, speed_range_of
+from sim2real.identification.held_out import MOVES
+from sim2real.identification.predictions import NOISE, Position
+from sim2real.identification.segments import Signal, range_of, speed_range_of
 
 _MARGIN = 1.25
 """The expected error over the worst error on held-out parts."""

@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from sim2real.identify.config import Loss
-from sim2real.identify.rollouts import OnCompile, Rollouts
-from sim2real.identify.segments import Data
+from sim2real.identification.config import Loss
+from sim2real.identification.rollouts import OnCompile, Rollouts
+from sim2real.identification.segments import Data
 from sim2real.types import MjModel
 
 mj: Any = mujoco

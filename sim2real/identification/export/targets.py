@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 import jinja2
 
 from sim2real.errors import UsageError
-from sim2real.identify.export.terms import Term, Terms
+from sim2real.identification.export.terms import Term, Terms
 
 _MJLAB_RANGES = {"joint_damping": "damping", "joint_armature": "armature", "joint_friction": "frictionloss"}
 """Function of mjlab -> term."""
@@ -84,7 +84,7 @@ def _rendered(target: str, terms: Terms, title: str, about: Sequence[tuple[str, 
     """Return a template's text; its lags are the least and the largest round trip, in steps of the physics."""
     trip, step_s = terms.delays.round_trip, terms.timestep_s
     least, most = (0, 0) if trip is None else (math.floor(trip.low / step_s), math.ceil(trip.high / step_s))
-    loader = jinja2.PackageLoader("sim2real.identify.export")
+    loader = jinja2.PackageLoader("sim2real.identification.export")
     environment = jinja2.Environment(
         loader=loader,
         trim_blocks=True,

@@ -17,12 +17,12 @@ from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
 from sim2real.graph.schedule import draw
 from sim2real.graph.windows import make_room
-from sim2real.identify.config import FitConfig
-from sim2real.identify.model import Channel, IdentifiableModel
-from sim2real.identify.parameters import ParameterTable
-from sim2real.identify.residuals import Linearised, Part, Residuals
-from sim2real.identify.rollouts import Engine, Rollouts, choose_engine
-from sim2real.identify.segments import Data, Retimed, Span, cut, data_of, padded, rounded
+from sim2real.identification.config import FitConfig
+from sim2real.identification.model import Channel, IdentifiableModel
+from sim2real.identification.parameters import ParameterTable
+from sim2real.identification.residuals import Linearised, Part, Residuals
+from sim2real.identification.rollouts import Engine, Rollouts, choose_engine
+from sim2real.identification.segments import Data, Retimed, Span, cut, data_of, padded, rounded
 
 MOST_OF_FIT = 4e7
 """Steps of single joints in a Jacobian from which a fit takes fewer segments: about 30 s on two cores."""
