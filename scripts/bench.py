@@ -94,7 +94,7 @@ def parse(arguments: Sequence[str]) -> tuple[Any, argparse.Namespace]:
 
 def origin(arguments: Sequence[str], options: argparse.Namespace) -> dict[str, Any]:
     """Return what a report says about itself: command, commit, date, machine, versions, seeds and all flags."""
-    from sim2real.artifacts.run.manifest import versions
+    from sim2real.artifacts.run import versions
 
     git = lambda *words: subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True).stdout  # noqa: E731
     # Reports name no folders of this machine.

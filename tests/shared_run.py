@@ -28,7 +28,7 @@ from sketches import sketched
 from sim2real import cli
 from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.recording import LOG, TRUTH, Recording
-from sim2real.artifacts.run.run_folder import finished, open_stage
+from sim2real.artifacts.run import finished, open_stage
 from sim2real.emulation.truth import Kind, TruthLog
 from sim2real.graph.episode import MessageRecord, StepRecord
 from sim2real.log.writer import McapRecorder

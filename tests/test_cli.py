@@ -14,8 +14,8 @@ from types import ModuleType
 import pytest
 
 from sim2real import cli, errors
+from sim2real.artifacts import run as run_folder
 from sim2real.artifacts.identification import Identification, Judgement
-from sim2real.artifacts.run import run_folder
 from sim2real.commands import flags, run, stages
 from sim2real.stages.config import RecordConfig
 from sim2real.stages.pipeline.pipeline import load_pipeline

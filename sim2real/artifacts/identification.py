@@ -21,7 +21,7 @@ from sim2real.artifacts.files import (
     write_json,
 )
 from sim2real.artifacts.posterior import Posterior
-from sim2real.artifacts.run.run_folder import Source
+from sim2real.artifacts.run import Source
 from sim2real.artifacts.summary import ArtifactTable, Interval, Shown
 from sim2real.artifacts.timing import TIMING, Timing
 from sim2real.errors import Sim2RealError

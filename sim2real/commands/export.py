@@ -75,7 +75,7 @@ def run(config: ExportConfig) -> Path:
 def find_parameters(source: str, runs: Path) -> Path:
     """Return the file of the identification that a text names: a file, a stage folder, a pipeline or a run."""
     from sim2real.artifacts.identification import PARAMETERS
-    from sim2real.artifacts.run.run_folder import newest, pipeline_of
+    from sim2real.artifacts.run import newest, pipeline_of
     from sim2real.stages.pipeline.find_run import find_run, warn_of_stale
 
     path = Path(source)
@@ -95,7 +95,7 @@ def find_bundle(source: str, runs: Path) -> Path:
     A pipeline without a training of its own gives the bundle that it ships.
     """
     from sim2real.artifacts.bundle import BUNDLE
-    from sim2real.artifacts.run.run_folder import newest, pipeline_of
+    from sim2real.artifacts.run import newest, pipeline_of
     from sim2real.errors import Sim2RealError
     from sim2real.policy.bundle import CONTRACT
     from sim2real.stages.pipeline.find_run import find_run, warn_of_stale

@@ -7,9 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from sim2real.artifacts.files import plain
-from sim2real.artifacts.run.manifest import versions
-from sim2real.artifacts.run.run_folder import STAGES, attempts, run_folders
-from sim2real.artifacts.run.stage_status import stage_status
+from sim2real.artifacts.run import STAGES, attempts, run_folders, stage_status, versions
 from sim2real.commands import flags
 from sim2real.commands.stages import DEMO_PIPELINE, examples_of, summary_of
 from sim2real.errors import Sim2RealError
@@ -127,13 +125,11 @@ def run(run_dir: Path) -> str:
     for stage in STAGES:
         for attempt in attempts(run_dir, stage):
             manifest, name = attempt.manifest, attempt.folder.name
-            status = "out of date" if name in stale else manifest["status"]
-            started, sha = manifest["started"][:19], (manifest.get("git") or {}).get("sha") or "-"
-            duration = manifest.get("duration_s")
-            rows.append([name, status, manifest.get("exit_code"), started, duration, sha[:10]])
-            for kind in ("inputs", "outputs"):
-                entries = manifest[kind].items()
-                files += [[name, kind[:-1], n, e["path"], e["sha256"][:10]] for n, e in entries]
+            status = "out of date" if name in stale else manifest.status
+            sha = (manifest.git or {}).get("sha") or "-"
+            rows.append([name, status, manifest.exit_code, manifest.started[:19], manifest.duration_s, sha[:10]])
+            for kind, sources in (("input", manifest.inputs), ("output", manifest.outputs)):
+                files += [[name, kind, n, source.path, source.sha256[:10]] for n, source in sources.items()]
     return "\n\n".join(
         [
             f"run  {shown(run_dir)}",

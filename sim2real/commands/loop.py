@@ -14,11 +14,10 @@ import numpy as np
 from sim2real.artifacts.bundle import Bundle, History
 from sim2real.artifacts.deployment import Deployment, Drift
 from sim2real.artifacts.identification import ROUND_TRIP, Estimate, Identification
+from sim2real.artifacts.iterations import Iteration, iterations, iterations_table
 from sim2real.artifacts.paths import shown
 from sim2real.artifacts.recording import Recording
-from sim2real.artifacts.run.iterations import Iteration, Iterations, Plan
-from sim2real.artifacts.run.run_folder import STAGES, StageFolder, attempts, finished, portable
-from sim2real.artifacts.run.stage_status import stage_status, why_stale
+from sim2real.artifacts.run import STAGES, StageFolder, finished, stage_status
 from sim2real.artifacts.summary import Shown
 from sim2real.commands.run import RunFlags
 from sim2real.errors import DelayChanged, Sim2RealError, UsageError
@@ -27,7 +26,7 @@ from sim2real.stages.deploy.next_command import logs_to_identify, needs_timing, 
 from sim2real.stages.pipeline.find_run import find_run
 from sim2real.stages.pipeline.pipeline import Pipeline, pipeline_of
 from sim2real.stages.pipeline.python_arguments import AnyPath, AnyRobot, config_of, folder_of
-from sim2real.stages.terminal.console import artifact_table, note, wrote
+from sim2real.stages.terminal.console import artifact_table, note
 
 CallStage = Callable[[str, Any, Path | None], StageFolder]
 """Runs a stage: its name, its configuration, the run folder; returns the stage's folder."""
@@ -36,7 +35,6 @@ MIN_SUCCESS = 0.95
 _MAX_RETRIES = 2
 """Bounds that widen without limit would hide a wrong model."""
 _LONGEST_DELAY_S = 1.0
-_ALL = ", ".join(STAGES)
 
 
 def run_all(pipeline: Pipeline, flags: RunFlags, call: CallStage) -> Path | None:
@@ -57,8 +55,6 @@ def run_all(pipeline: Pipeline, flags: RunFlags, call: CallStage) -> Path | None
         raise UsageError(f"{shipped}, and iterations train another one", hint="run without --iterations")
     if flags.iterations > 1:
         return _Iterating(pipeline, flags, call).run(run_dir)
-    if run_dir is not None and (plan := Iterations.load(run_dir).plan) is not None:
-        note(f"an iteration of this run was interrupted ({plan.words}): --iterations N continues it")
     # Skip the stages with a current result. After a stage that runs, the results of all later stages are out of date.
     rerun = False
     for number, stage in enumerate(STAGES, 1):
@@ -93,16 +89,34 @@ def why_shipped(pipeline: Pipeline) -> str:
     )
 
 
+@dataclass(frozen=True)
+class Plan:
+    """The stages to run next, in order; none if the run stops.
+
+    Attributes:
+        words: The plan, or why the run stops, as text.
+        log: The logs to identify from; empty for the newest recording.
+        terms: The optional terms to identify with; None for the flags' value.
+        seed: The seed of the training; None for the flags' value.
+    """
+
+    stages: tuple[str, ...]
+    words: str
+    log: tuple[str, ...] = ()
+    terms: str | None = None
+    seed: int | None = None
+
+
 @dataclass
 class _Iterating:
-    """The iterations of a run. Each plan is on disk before its first stage, so that an interrupted run goes on."""
+    """The iterations of a run. Each plan follows from the run folder alone, so that an interrupted run goes on."""
 
     pipeline: Pipeline
     flags: RunFlags
     call: CallStage
 
     def run(self, run_dir: Path | None) -> Path:
-        """Run a plan, judge its deployment, write the next plan; until a plan has no stages.
+        """Run the stages of a plan, make the next plan; until a plan has no stages.
 
         Args:
             run_dir: The run's folder; None: the first stage makes it.
@@ -110,119 +124,58 @@ class _Iterating:
         Raises:
             DelayChanged: The deployment of the last iteration was refused.
         """
-        # In a run whose four stages are current, the newest deployment is judged first.
-        before = Iterations() if run_dir is None else Iterations.load(run_dir)
-        status = {} if run_dir is None else stage_status(run_dir)
-        current = set(status) == set(STAGES) and not any(s.stale for s in status.values())
-        rows, plan = before.rows, before.plan or Plan(() if current else STAGES, _ALL)
-        while True:
+        if self.flags.deploy.dry_run:
+            raise UsageError(
+                "a dry deployment moves nothing, so no iteration follows from it", hint="run without --deploy.dry-run"
+            )
+        refusal, rows = None, list[Iteration]()
+        plan = Plan(STAGES, ", ".join(STAGES)) if run_dir is None else self._plan(run_dir)
+        while plan.stages:
             refusal = None
             for stage in plan.stages:
                 note(f"{stage} (iteration {len(rows) + 1})")
                 try:
-                    run_dir = self._stage(stage, self._config(plan, stage, run_dir), run_dir, plan.before).run_dir
+                    run_dir = self._stage(stage, self._config(plan, stage), run_dir).run_dir
                 except DelayChanged as error:
                     refusal = error
                     break
             if run_dir is None:
                 raise refusal or UsageError("this run has no folder, because no stage ran")
-            # The row of the iteration lists the attempts that no earlier row lists.
-            listed = {name for row in rows for name in row.stages}
-            made = [a for s in STAGES for a in attempts(run_dir, s) if a.finished]
-            done = [a.folder.name for a in sorted(made, key=lambda a: str(a.manifest["started"]))]
-            row = Iteration(len(rows) + 1, tuple(name for name in done if name not in listed))
-            if refusal is not None:
-                # The policy was refused before it moved the robot: no log shows the robot as it is now.
-                row = replace(row, verdict="re-identify", why=str(refusal.args[0]))
-                plan = self._all_stages(run_dir)
-            else:
-                deployment = _newest_deployment(run_dir)
-                if rows and rows[-1].deployment == deployment.folder.name:
-                    # It was judged before; the flags may differ now, so the last row is written again.
-                    row, rows = rows[-1], rows[:-1]
-                row, plan = self._judge(row, run_dir, deployment)
-            if plan.stages and row.number >= self.flags.iterations:
-                plan = Plan((), f"the last iteration: it would {plan.words}")
-            rows = (*rows, replace(row, then=plan.words))
-            plan = replace(plan, before=tuple(done))
-            wrote(Iterations(rows, plan if plan.stages else None).save(run_dir))
-            note(f"iteration {row.number}: {row.verdict}; {plan.words}")
-            if not plan.stages:
-                break
+            plan, rows = self._plan(run_dir), iterations(run_dir)
+            note(f"iteration {len(rows)}: {rows[-1].verdict}; {plan.words}")
         if refusal is not None:
             raise refusal
-        print(artifact_table(Iterations(rows).table().without("why")))
+        assert run_dir is not None  # only a plan for a run that exists has no stages
+        print(artifact_table(iterations_table(iterations(run_dir)).without("why")))
         return run_dir
 
-    def _config(self, plan: Plan, stage: str, run_dir: Path | None) -> Any:
-        """Return the configuration of a stage: that of the flags, with the changes of the plan."""
-        if stage == "identify" and plan.terms is not None:
-            log = tuple(shown(Path(run_dir or "") / path) for path in plan.log)
-            return replace(self.flags.identify, log=log, terms=plan.terms)
-        if stage == "train" and plan.seed is not None:
-            return replace(self.flags.train, seed=plan.seed)
-        return getattr(self.flags, stage)
+    def _plan(self, run_dir: Path) -> Plan:
+        """Return the plan that follows from the stages of a run."""
+        rows, status = iterations(run_dir), stage_status(run_dir)
+        lacking = tuple(s for s in STAGES if s not in status or status[s].stale)
+        if not rows:
+            return Plan(lacking, ", ".join(lacking))
+        last = rows[-1]
+        drift = None if last.refused else Deployment.read(last.deployment.folder).drift
+        # A recording that is older than the refusal of a policy shows another robot.
+        recorded = status["record"].newest.manifest.started if "record" in status else ""
+        if last.refused and recorded < last.deployment.manifest.started:
+            plan = self._anew(run_dir, STAGES, drift)
+        elif lacking:
+            # The run was interrupted, or a stage was made by hand. An identification from named logs may not suffice.
+            known = status.get("identify")
+            if lacking[0] == "train" and known is not None and (known.newest.manifest.config or {}).get("log"):
+                lacking = STAGES if _why_insufficient(self._newest_identification(run_dir)) else lacking
+            return self._anew(run_dir, lacking, drift)
+        else:
+            plan = self._after(run_dir, last.deployment)
+        if plan.stages and len(rows) >= self.flags.iterations:
+            return Plan((), f"the last iteration: it would {plan.words}")
+        return plan
 
-    def _stage(self, stage: str, config: Any, run_dir: Path | None, before: tuple[str, ...]) -> StageFolder:
-        """Run a stage, with retries; record first where the logs of a deployment do not suffice to identify from.
-
-        A policy that holds still excites no parameter; one that balances amplifies errors a hundredfold.
-
-        Args:
-            before: Stage folders that were finished when the iteration started.
-        """
-        if stage != "identify" or not config.log:
-            return self._with_retries(stage, config, run_dir, before)
-        try:
-            folder = self._with_retries(stage, config, run_dir, before)
-            reason = _why_insufficient(Identification.load(folder.output("parameters")))
-        except DelayChanged:
-            raise
-        except Sim2RealError as error:
-            folder, reason = None, str(error.args[0])
-        if folder is not None and not reason:
-            return folder
-        note(f"the deployment's own logs do not suffice ({reason}): record, identify from that")
-        recorded = self._once("record", self.flags.record, run_dir, before)
-        known = (*before, *(() if folder is None else (folder.folder.name,)))
-        return self._with_retries(stage, replace(config, log=()), recorded.run_dir, known)
-
-    def _with_retries(self, stage: str, config: Any, run_dir: Path | None, before: tuple[str, ...]) -> StageFolder:
-        """Run a stage; again while an estimate lies at a bound, or a policy fails in simulation.
-
-        A worn robot leaves the bounds of a data sheet; a policy for more friction takes more steps to train.
-        """
-        folder = self._once(stage, config, run_dir, before)
-        for _ in range(_MAX_RETRIES):
-            changed = _changed_config(config, folder)
-            if changed is None:
-                break
-            config, reason = changed
-            note(f"{stage} again: {reason}")
-            folder = self.call(stage, config, folder.run_dir)
-        return folder
-
-    def _once(self, stage: str, config: Any, run_dir: Path | None, before: tuple[str, ...]) -> StageFolder:
-        """Return the attempt that an interrupted iteration has finished, if it is current; otherwise run the stage."""
-        done = None if run_dir is None else finished(run_dir, stage)
-        if run_dir is not None and done is not None and done.folder.name not in before:
-            if not (reason := why_stale(done, stage_status(run_dir))):
-                note(f"{stage}: {done.folder.name} is finished, skipped")
-                return done
-            note(f"{stage}: {reason}")
-        return self.call(stage, config, run_dir)
-
-    def _judge(self, row: Iteration, run_dir: Path, folder: StageFolder) -> tuple[Iteration, Plan]:
-        """Return an iteration's row, completed with the results of its deployment, and the plan of the next one."""
+    def _after(self, run_dir: Path, folder: StageFolder) -> Plan:
+        """Return the plan that follows from the newest deployment."""
         deployment = Deployment.read(folder.folder)
-        if success := next((g for g in deployment.gap if g.quantity == "success"), None):
-            row = replace(row, real=success.real, simulation=success.simulation)
-        if advice := deployment.advice:
-            row = replace(row, verdict=advice.status, why=next(iter(advice.reasons), ""))
-        return row, self._next_plan(run_dir, folder, deployment)
-
-    def _next_plan(self, run_dir: Path, folder: StageFolder, deployment: Deployment) -> Plan:
-        """Return the plan that follows from a deployment; a plan without stages ends the run."""
         # Stop at the goal, or if no stage can improve the result.
         if self.flags.goal and _reached(deployment, *self.flags.goal):
             return Plan((), "stop: {} is at least {:g}".format(*self.flags.goal))
@@ -242,17 +195,61 @@ class _Iterating:
         deployed = [path for name, path in outputs if name.startswith("log_") or name == "probe"]
         logs = logs_to_identify(deployed, deployment.drift, identification, folder.folder)
         if not logs:
-            return self._all_stages(run_dir, deployment.drift)
+            return self._anew(run_dir, STAGES, deployment.drift)
         terms = terms_to_identify(self.flags.identify.terms, self.pipeline, identification, deployment.drift)
         words = f"identify from {len(logs)} log{'s' * (len(logs) > 1)}, the deployment's among them, train, deploy"
-        log = tuple(portable(Path(path), run_dir) for path in logs)
-        return Plan(("identify", "train", "deploy"), words, log, terms, seed)
+        return Plan(("identify", "train", "deploy"), words, logs, terms, seed)
 
-    def _all_stages(self, run_dir: Path, drift: Drift | None = None) -> Plan:
-        """Return the plan for a robot that no log shows as it is now."""
+    def _anew(self, run_dir: Path, stages: tuple[str, ...], drift: Drift | None) -> Plan:
+        """Return the plan to run stages from new recordings, with the terms of the newest identification."""
+        words = ", ".join(stages)
+        if finished(run_dir, "identify") is None:
+            return Plan(stages, words)
         known = self._newest_identification(run_dir)
         terms = terms_to_identify(self.flags.identify.terms, self.pipeline, known, drift)
-        return Plan(STAGES, _ALL, terms=terms, seed=self._next_seed(run_dir))
+        return Plan(stages, words, terms=terms, seed=self._next_seed(run_dir))
+
+    def _config(self, plan: Plan, stage: str) -> Any:
+        """Return the configuration of a stage: that of the flags, with the changes of the plan."""
+        if stage == "identify" and plan.terms is not None:
+            return replace(self.flags.identify, log=plan.log, terms=plan.terms)
+        if stage == "train" and plan.seed is not None:
+            return replace(self.flags.train, seed=plan.seed)
+        return getattr(self.flags, stage)
+
+    def _stage(self, stage: str, config: Any, run_dir: Path | None) -> StageFolder:
+        """Run a stage, with retries; record first where the logs of a deployment do not suffice to identify from.
+
+        A policy that holds still excites no parameter; one that balances amplifies errors a hundredfold.
+        """
+        if stage != "identify" or not config.log:
+            return self._with_retries(stage, config, run_dir)
+        try:
+            folder = self._with_retries(stage, config, run_dir)
+            if not (reason := _why_insufficient(Identification.load(folder.output("parameters")))):
+                return folder
+        except DelayChanged:
+            raise
+        except Sim2RealError as error:
+            reason = str(error.args[0])
+        note(f"the deployment's own logs do not suffice ({reason}): record, identify from that")
+        recorded = self.call("record", self.flags.record, run_dir)
+        return self._with_retries("identify", replace(config, log=()), recorded.run_dir)
+
+    def _with_retries(self, stage: str, config: Any, run_dir: Path | None) -> StageFolder:
+        """Run a stage; again while an estimate lies at a bound, or a policy fails in simulation.
+
+        A worn robot leaves the bounds of a data sheet; a policy for more friction takes more steps to train.
+        """
+        folder = self.call(stage, config, run_dir)
+        for _ in range(_MAX_RETRIES):
+            changed = _changed_config(config, folder)
+            if changed is None:
+                break
+            config, reason = changed
+            note(f"{stage} again: {reason}")
+            folder = self.call(stage, config, folder.run_dir)
+        return folder
 
     def _newest_identification(self, run_dir: Path) -> Identification:
         folder = finished(run_dir, "identify")
@@ -263,15 +260,7 @@ class _Iterating:
     def _next_seed(self, run_dir: Path) -> int:
         """Return the seed after that of the newest training: the same seed would train the same policy."""
         training = finished(run_dir, "train")
-        return 1 + (int(training.manifest["config"]["seed"]) if training is not None else self.flags.train.seed)
-
-
-def _newest_deployment(run_dir: Path) -> StageFolder:
-    if (deployment := finished(run_dir, "deploy")) is None:
-        raise UsageError(
-            "this run has no deployment to judge", hint="run without --deploy.dry-run: a dry deployment moves nothing"
-        )
-    return deployment
+        return 1 + int(training.manifest.config["seed"]) if training is not None else self.flags.train.seed
 
 
 def _reached(deployment: Deployment, quantity: str, minimum: float) -> bool:

@@ -17,7 +17,7 @@ from sim2real.stages.pipeline.pipeline import available
 
 if TYPE_CHECKING:
     from sim2real.artifacts.comparison import Comparison
-    from sim2real.artifacts.run.run_folder import StageFolder
+    from sim2real.artifacts.run import StageFolder
     from sim2real.commands.loop import Run
 
 COMPARISON = "compare.html"
@@ -102,7 +102,7 @@ def report(run: str | Path | Run, runs: str | Path = "runs") -> Path:
 
 def _show(run_dir: Path, target: str, follow: bool) -> None:
     """Show a run in the viewer, or write a file for it."""
-    from sim2real.artifacts.run.run_folder import pipeline_of
+    from sim2real.artifacts.run import pipeline_of
     from sim2real.stages.live import scene as scenes
     from sim2real.stages.pipeline.pipeline import load_pipeline
     from sim2real.stages.terminal.console import wrote
@@ -134,13 +134,13 @@ def compare(config: ReportConfig) -> Comparison:
 
     # Find the runs, which must be of one robot.
     all_stages = [_stages_of(target, config.runs) for target in config.targets]
-    robots = list(dict.fromkeys(str(next(iter(stages.values())).manifest["pipeline"]) for stages in all_stages))
+    robots = list(dict.fromkeys(next(iter(stages.values())).manifest.pipeline for stages in all_stages))
     if len(robots) > 1:
         raise UsageError(f"these are runs of different robots: {', '.join(robots)}", hint="compare runs of one robot")
     # Read the artifacts of each run, and compare them.
     runs = []
     for name, stages in zip(_names(all_stages), all_stages, strict=True):
-        started = min(str(stage.manifest.get("started", "")) for stage in stages.values())
+        started = min(stage.manifest.started for stage in stages.values())
         identify, deploy = stages.get("identify"), stages.get("deploy")
         identification = None if identify is None else Identification.load(identify.folder)
         deployment = None if deploy is None else Deployment.read(deploy.folder)
@@ -172,12 +172,10 @@ def compare(config: ReportConfig) -> Comparison:
 
 def _stages_of(target: str, root: Path) -> dict[str, StageFolder]:
     """Return the finished stages of a run; a stage folder selects its run, with that attempt of the stage."""
-    from sim2real.artifacts.run.manifest import read_manifest
-    from sim2real.artifacts.run.run_folder import finished_stages, open_folder
+    from sim2real.artifacts.run import StageFolder, finished_stages
 
     stages = finished_stages(find_run(root, target))
-    if (manifest := read_manifest(Path(target))) is not None:
-        attempt = open_folder(Path(target), str(manifest["stage"]))
+    if (attempt := StageFolder.read(Path(target))) is not None:
         stages |= {attempt.stage: attempt}
     return stages
 

@@ -16,7 +16,7 @@ from sim2real.stages.flag import Flag
 from sim2real.stages.pipeline.pipeline import Pipeline, load_pipeline
 
 if TYPE_CHECKING:
-    from sim2real.artifacts.run.run_folder import StageFolder
+    from sim2real.artifacts.run import StageFolder
 
 _FIGURES = {
     "record": ("seconds", "lost replies", "late replies"),
@@ -142,7 +142,7 @@ def _run(pipeline: Pipeline, parsed: RunFlags) -> None:
 def conclude(run_dir: Path) -> None:
     """Write the page of a run; print the verdict and the name of the page."""
     from sim2real.artifacts.deployment import Deployment
-    from sim2real.artifacts.run.run_folder import finished
+    from sim2real.artifacts.run import finished
     from sim2real.stages.terminal import console
 
     page = write_report(run_dir)
@@ -157,7 +157,7 @@ def main_figures(done: StageFolder) -> dict[str, Any]:
     from sim2real.artifacts.deployment import Deployment
     from sim2real.artifacts.identification import Identification
 
-    summary = done.manifest["summary"] or {}
+    summary = done.manifest.summary
     figures = {name: summary[name] for name in _FIGURES[done.stage] if name in summary}
     if done.stage == "identify" and (rows := Identification.load(done.output("parameters")).held_out):
         worst, which = rows[0], ", the worst joint" if len(rows) > 1 else ""

@@ -17,7 +17,7 @@ from sim2real.stages.flag import Flag
 from sim2real.stages.pipeline.pipeline import Pipeline, available, load_pipeline
 
 if TYPE_CHECKING:
-    from sim2real.artifacts.run.run_folder import StageFolder
+    from sim2real.artifacts.run import StageFolder
 
 DEMO_PIPELINE = "pendulum"
 Config = TypeVar("Config")
@@ -105,8 +105,8 @@ def run_stage(
     folder: StageFolder | None = _imported(name).run(pipeline, config, runs, run_dir)
     if folder is None:
         return None
-    if folder.manifest["summary"]:
-        print(console.pairs(folder.manifest["summary"]))
+    if folder.manifest.summary:
+        print(console.pairs(folder.manifest.summary))
     for path in [*folder.outputs.values(), folder.folder / "manifest.json"]:
         console.wrote(path)
     if page:

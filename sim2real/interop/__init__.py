@@ -55,7 +55,7 @@ def robot_environment(
         UsageError: When there is no such pipeline, run or parameter.
         Sim2RealError: When there is no identification, or not of this robot.
     """
-    from sim2real.artifacts.run.run_folder import STAGES, attempts
+    from sim2real.artifacts.run import STAGES, attempts
     from sim2real.interop.environments import RobotEnvironment
     from sim2real.robots.robot import Robot
     from sim2real.stages.pipeline.find_run import find_run
@@ -71,7 +71,7 @@ def robot_environment(
         pipeline, run = load_pipeline(str(source)), None
     else:
         run = find_run(Path(runs), source)
-        pipeline = load_pipeline(next(str(a.manifest.get("pipeline")) for s in STAGES for a in attempts(run, s)))
+        pipeline = load_pipeline(next(a.manifest.pipeline for s in STAGES for a in attempts(run, s)))
     config = replace(config or pipeline.train, model=model)
     path, _ = find_parameters(pipeline, config, Path(runs), run)
     identification = None if path is None else open_identification(path, pipeline)

@@ -10,7 +10,7 @@ import numpy as np
 
 from sim2real.artifacts.files import write_json
 from sim2real.artifacts.identification import UNFINISHED, Identification
-from sim2real.artifacts.run.manifest import sha256
+from sim2real.artifacts.run import sha256
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
 from sim2real.identification.export.card import differing, write_card

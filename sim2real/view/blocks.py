@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from sim2real.artifacts.run.run_folder import StageFolder
+from sim2real.artifacts.run import StageFolder
 from sim2real.artifacts.summary import ArtifactTable, Cell, Interval
 
 MISSING = "–"  # noqa: RUF001 - a dash, as is usual in tables
@@ -267,15 +267,14 @@ def pairs_table(caption: str, tree: object) -> TableBlock:
 def about(artifact: StageFolder) -> list[Block]:
     """Return configuration, files and versions of a stage as a folded block."""
     m = artifact.manifest
-    when = {k: m[k] for k in ("started", "duration_s", "command", "git") if m.get(k) is not None}
-    files = {n: e.get("sha256", "") for n, e in m.get("outputs", {}).items()}
+    when = {k: v for k in ("started", "duration_s", "command", "git") if (v := getattr(m, k))}
     tables = {
-        "Summary": m.get("summary"),
-        "Configuration": m.get("config"),
+        "Summary": m.summary,
+        "Configuration": m.config,
         "Run": when,
-        "Inputs": m.get("inputs"),
-        "Outputs, by SHA-256": files,
-        "Versions": m.get("versions"),
+        "Inputs": {n: vars(source) for n, source in m.inputs.items()},
+        "Outputs, by SHA-256": {n: source.sha256 for n, source in m.outputs.items()},
+        "Versions": m.versions,
     }
     blocks = [pairs_table(caption, tree) for caption, tree in tables.items() if tree]
     return [FoldBlock("Configuration, files and versions", blocks)] if blocks else []

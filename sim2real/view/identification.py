@@ -16,7 +16,7 @@ from sim2real.artifacts.identification import (
     links_table,
     tried_table,
 )
-from sim2real.artifacts.run.run_folder import StageFolder
+from sim2real.artifacts.run import StageFolder
 from sim2real.log.schema import unit_of
 from sim2real.view import style
 from sim2real.view.blocks import (

@@ -6,8 +6,7 @@ from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from sim2real.artifacts.run.run_folder import STAGES, StageFolder, attempts, finished_stages
-from sim2real.artifacts.run.stage_status import stage_status
+from sim2real.artifacts.run import STAGES, StageFolder, attempts, finished_stages, stage_status
 from sim2real.view.blocks import NoteBlock, PageSection
 from sim2real.view.sections import SECTIONS, iterations_sections
 
@@ -32,14 +31,14 @@ def report(run_dir: Path, out: Path | None = None) -> Path:
     artifacts = finished_stages(run_dir)
     sections = [SECTIONS[stage](artifact) for stage, artifact in artifacts.items()] + iterations_sections(run_dir)
     manifests = [artifact.manifest for artifact in artifacts.values()]
-    started = min((str(m["started"]) for m in manifests if "started" in m), default="")
+    started = min(m.started for m in manifests)
     return write_page(
         out or run_dir / PAGE,
-        next((str(m["pipeline"]) for m in manifests if "pipeline" in m), "run"),
+        manifests[0].pipeline,
         sections,
         run=run_dir.resolve().name,
         started=started.replace("T", " ")[:19] + (" UTC" if started.endswith("+00:00") else ""),
-        version=next((m["versions"].get("sim2real") for m in manifests if "versions" in m), ""),
+        version=next((m.versions.get("sim2real") or "" for m in manifests), ""),
         absent={stage: _tried(run_dir, stage) for stage in STAGES if stage not in artifacts},
         notes=_about_others(run_dir, artifacts),
     )
@@ -88,7 +87,7 @@ def write_page(
 def _tried(run_dir: Path, stage: str) -> str:
     """Return what became of a stage that is not finished: its newest attempt's status, or ``not yet``."""
     tried = attempts(run_dir, stage)
-    return str(tried[0].manifest.get("status", "not yet")) if tried else "not yet"
+    return tried[0].manifest.status if tried else "not yet"
 
 
 def _about_others(run_dir: Path, artifacts: dict[str, StageFolder]) -> list[NoteBlock]:
@@ -98,9 +97,9 @@ def _about_others(run_dir: Path, artifacts: dict[str, StageFolder]) -> list[Note
     for stage in STAGES:
         tried = attempts(run_dir, stage)
         if tried and (stage not in artifacts or tried[0].folder != artifacts[stage].folder):
-            status = tried[0].manifest.get("status", "without a manifest")
+            status = tried[0].manifest.status
             status = "a dry run" if status == "dry run" else status
-            error = tried[0].manifest.get("error")
+            error = tried[0].manifest.error
             shown = (
                 f"this page shows {artifacts[stage].folder.name}"
                 if stage in artifacts

@@ -9,7 +9,7 @@ import numpy as np
 from sim2real.artifacts.deployment import Deployment
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.recording import Recording
-from sim2real.artifacts.run.run_folder import StageFolder
+from sim2real.artifacts.run import StageFolder
 from sim2real.graph.episode import TICKS_PER_S, Episode, Steps
 from sim2real.log.schema import unit_of
 from sim2real.view.signals import Series, Signals, signals_of, simulated_beside

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sim2real.artifacts.run.run_folder import finished_stages, pipeline_of
+from sim2real.artifacts.run import finished_stages, pipeline_of
 from sim2real.graph.episode import TICKS_PER_S, Episode
 from sim2real.view.node_looks import color_of, in_order, slowest_period_s
 from sim2real.view.rerun_content import IDLE, Curve, Tab, readable, states_of, tabs_of

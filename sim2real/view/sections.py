@@ -12,9 +12,9 @@ from sim2real.artifacts.bundle import GOOD_SUCCESS, History
 from sim2real.artifacts.deployment import Deployment, Scores
 from sim2real.artifacts.episodes import Episodes
 from sim2real.artifacts.identification import Identification, with_small_unit, worst_window
+from sim2real.artifacts.iterations import iterations, iterations_table
 from sim2real.artifacts.recording import Recording
-from sim2real.artifacts.run.iterations import Iterations
-from sim2real.artifacts.run.run_folder import StageFolder, finished
+from sim2real.artifacts.run import StageFolder, finished
 from sim2real.artifacts.sensitivity import SENSITIVITY, Sensitivity
 from sim2real.artifacts.summary import words_and_unit
 from sim2real.graph.episode import Episode
@@ -435,11 +435,10 @@ def _deploy_tables(deployed: Deployment) -> list[Block]:
 
 def iterations_sections(run_dir: Path) -> list[PageSection]:
     """Return the section about a run's iterations; empty for a run without iterations."""
-    iterations = Iterations.load(run_dir)
-    rows = iterations.rows
-    if not rows:
+    rows = iterations(run_dir)
+    if len(rows) < 2:
         return []
-    block = TableBlock.of("Stages, success and verdict of each iteration", iterations.table())
+    block = TableBlock.of("Stages, success and verdict of each iteration", iterations_table(rows))
     best = [r.real for r in rows if r.real is not None]
     tiles = [Tile("iterations", str(len(rows)), rows[-1].verdict)]
     if best:

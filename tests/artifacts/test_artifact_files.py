@@ -19,14 +19,12 @@ from sim2real.artifacts.episodes import Episodes, Varied
 from sim2real.artifacts.files import plain, read_arrays, read_json, write_arrays, write_json
 from sim2real.artifacts.identification import Estimate, Identification, Judgement, Matrix, Noise
 from sim2real.artifacts.posterior import Posterior
-from sim2real.artifacts.run.iterations import Iterations
-from sim2real.artifacts.run.manifest import read_manifest, write_manifest
-from sim2real.artifacts.run.run_folder import Source
+from sim2real.artifacts.run import Manifest, Source, StageFolder, write_manifest
 from sim2real.artifacts.sensitivity import Sensitivity
 from sim2real.artifacts.timing import NONE, ConnectionTiming, NodeTiming, Spread, Timing
 from sim2real.errors import Sim2RealError
 
-FILES = (Deployment, Episodes, History, Identification, Iterations, Sensitivity, Timing)
+FILES = (Deployment, Episodes, History, Identification, Sensitivity, Timing)
 ODD = [
     "\U0001f600",
     "\x7f",
@@ -154,11 +152,11 @@ def test_an_array_whose_name_a_zip_file_cuts_off_is_refused(tmp_path):
 @pytest.mark.parametrize("seed", range(5))
 def test_manifests(tmp_path, seed):
     rng = random.Random(seed)
-    entries = {drawn(str, rng): {"path": drawn(str, rng), "sha256": drawn(str, rng)}}
-    texts = {key: drawn(str, rng) for key in ("pipeline", "stage", "status", "started")}
-    written = {**texts, "inputs": entries, "outputs": {}, "summary": {drawn(str, rng): drawn(float, rng)}}
+    source = Source(drawn(str, rng), drawn(str, rng))
+    texts = [drawn(str, rng) for _ in range(4)]
+    written = Manifest(*texts, inputs={drawn(str, rng): source}, summary={drawn(str, rng): drawn(float, rng)})
     write_manifest(tmp_path, written)
-    assert read_manifest(tmp_path) == plain(written)
+    assert plain(StageFolder.read(tmp_path).manifest) == plain(written)
 
 
 def test_a_document_without_infinity_reads_as_before(tmp_path):

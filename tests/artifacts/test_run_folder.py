@@ -6,14 +6,15 @@ import os
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from sim2real.artifacts.run import manifest, run_folder
-from sim2real.artifacts.run.manifest import git_state, read_manifest, sha256, write_manifest
+from sim2real.artifacts import run as run_folder
+from sim2real.artifacts.run import Manifest, StageFolder, git_state, sha256, write_manifest
 from sim2real.commands import info
 from sim2real.errors import SafetyStop, Sim2RealError, UsageError
 from sim2real.stages.config import RecordConfig, TrainConfig
@@ -63,7 +64,7 @@ class Clock:
 DIES = """
 import os, signal, sys
 from pathlib import Path
-from sim2real.artifacts.run.run_folder import open_stage
+from sim2real.artifacts.run import open_stage
 with open_stage(Path(sys.argv[1]), "pendulum", "train", None) as stage:
     if sys.argv[2] == "forked":
         read, write = os.pipe()
@@ -84,7 +85,7 @@ def test_every_reader_says_of_a_stage_that_was_killed_that_it_died(tmp_path, chi
 
     def status():
         (attempt,) = run_folder.attempts(folder.parent, "train")
-        return attempt.manifest["status"], *(word for word in ("running", "died") if word in info.run(folder.parent))
+        return attempt.manifest.status, *(word for word in ("running", "died") if word in info.run(folder.parent))
 
     assert status() == ("running", "running")
     process.kill()
@@ -92,8 +93,8 @@ def test_every_reader_says_of_a_stage_that_was_killed_that_it_died(tmp_path, chi
     assert status() == ("died", "died")
     assert not run_folder.finished(folder.parent, "train")
     with run_folder.open_stage(tmp_path, "pendulum", "train", None, run_dir=folder.parent) as again:
-        assert [a.manifest["status"] for a in run_folder.attempts(folder.parent, "train")] == ["running", "died"]
-    assert again.result.manifest["status"] == "finished"
+        assert [a.manifest.status for a in run_folder.attempts(folder.parent, "train")] == ["running", "died"]
+    assert again.result.manifest.status == "finished"
 
 
 def test_a_stage_that_ends_while_it_is_read_did_not_die(tmp_path):
@@ -103,7 +104,8 @@ def test_a_stage_that_ends_while_it_is_read_did_not_die(tmp_path):
     def read():
         while not stop.is_set():
             for folder in tmp_path.glob("pendulum/*/record"):
-                seen.add((read_manifest(folder) or {"status": "running"})["status"])
+                read = StageFolder.read(folder)
+                seen.add("running" if read is None else read.manifest.status)
 
     reader = threading.Thread(target=read)
     reader.start()
@@ -115,10 +117,10 @@ def test_a_stage_that_ends_while_it_is_read_did_not_die(tmp_path):
 
 
 def test_without_locks_a_stage_counts_as_running(tmp_path, monkeypatch):
-    monkeypatch.setattr(manifest, "fcntl", None)
+    monkeypatch.setattr(run_folder, "fcntl", None)
     with run_folder.open_stage(tmp_path, "pendulum", "record", None) as stage:
         (attempt,) = run_folder.attempts(stage.run_dir, "record")
-        assert attempt.manifest["status"] == "running"
+        assert attempt.manifest.status == "running"
 
 
 @pytest.mark.parametrize(
@@ -231,10 +233,10 @@ def test_two_at_work_in_one_run_do_not_meet(tmp_path):
         a.summary({"who": "A"})
     assert [f.name for f in (a.folder, b.folder)] == ["train", "train.2"]
     for one, who in ((a, "A"), (b, "B")):
-        read = run_folder.StageFolder(one.folder, read_manifest(one.folder))
-        assert read.manifest["config"] == read.manifest["summary"] == {"who": who}
+        read = StageFolder.read(one.folder)
+        assert read.manifest.config == read.manifest.summary == {"who": who}
         assert read.output("policy").read_text() == who
-        assert sha256(read.output("policy")) == read.manifest["outputs"]["policy"]["sha256"]
+        assert sha256(read.output("policy")) == read.manifest.outputs["policy"].sha256
     assert run_folder.finished(a.run_dir, "train").folder == b.folder, "the one that started last"
 
 
@@ -243,11 +245,11 @@ def test_what_refers_to_an_attempt_stays_right_when_the_stage_runs_again(tmp_pat
     with run_folder.open_stage(tmp_path, "pendulum", "identify", None, {"log": log}, log.parent.parent) as stage:
         pass
     record(tmp_path, stage.run_dir, text="2")
-    source = stage.result.manifest["inputs"]["log"]
-    assert source["path"] == "record/session.mcap"
+    source = stage.result.manifest.inputs["log"]
+    assert source.path == "record/session.mcap"
     moved = tmp_path / "elsewhere"
     stage.run_dir.rename(moved)
-    assert sha256(moved / source["path"]) == source["sha256"]
+    assert sha256(moved / source.path) == source.sha256
 
 
 @pytest.mark.parametrize("name", ["../../../etc", "..", "a/b", "", ".hidden", "/etc", "a\nb"])
@@ -294,10 +296,11 @@ def test_outputs_that_are_unknown_or_gone(tmp_path):
 
 
 def test_a_manifest_that_cannot_be_written_leaves_the_old_one(tmp_path):
-    write_manifest(tmp_path, {"status": "running"})
+    manifest = Manifest("pendulum", "record", "running", "")
+    write_manifest(tmp_path, manifest)
     with pytest.raises(TypeError):
-        write_manifest(tmp_path, {"status": object()})
-    assert json.loads((tmp_path / "manifest.json").read_text()) == {"status": "running"}
+        write_manifest(tmp_path, replace(manifest, config=object()))
+    assert json.loads((tmp_path / "manifest.json").read_text())["config"] is None
 
 
 def test_hash_of_a_folder_depends_on_names_and_contents(tmp_path):

@@ -8,7 +8,7 @@ import lerobot_sets as sets
 from lerobot_sets import NAMES, calibration, data_set, motion, written
 
 from sim2real import cli
-from sim2real.artifacts.run.run_folder import newest
+from sim2real.artifacts.run import newest
 from sim2real.errors import UsageError
 from sim2real.log import read_log
 from sim2real.log.importing.importer import import_table
@@ -71,7 +71,7 @@ def test_all_episodes_lead_to_an_so101_in_one_run(tmp_path, monkeypatch, capsys)
     assert "unit" in capsys.readouterr().err
     assert cli.main(["import", "set", "--like", "so101", "--calibration", "arm.json"]) == 0
     stage = newest(tmp_path / "runs", "so101", "record")
-    assert stage.manifest["summary"]["episodes"] == 3
+    assert stage.manifest.summary["episodes"] == 3
     for name, (goal, q) in zip(("log", "log_1", "log_2"), EPISODES, strict=True):
         episode = read_log(stage.output(name))
         assert episode.metadata["pipeline"] == "so101"

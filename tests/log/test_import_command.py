@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sim2real import cli
-from sim2real.artifacts.run.run_folder import newest
+from sim2real.artifacts.run import newest
 from sim2real.log import import_file, read_log
 from sim2real.view.sections import record_banner
 from sim2real.view.signals import Signals
@@ -46,9 +46,9 @@ def test_each_file_becomes_a_run_with_the_pipelines_mapping(workplace, capsys):
     assert "stamps     actuator generated, sensor recorded" in out
     stage = newest(Path("runs"), "rig", "record")
     assert stage.finished
-    assert stage.manifest["summary"]["samples"] == {"actuator": 50, "sensor": 50}
-    assert stage.manifest["inputs"]["source"]["path"] == "../../../two.npz"
-    assert stage.manifest["inputs"]["mapping"]["path"].endswith("import.toml")
+    assert stage.manifest.summary["samples"] == {"actuator": 50, "sensor": 50}
+    assert stage.manifest.inputs["source"].path == "../../../two.npz"
+    assert stage.manifest.inputs["mapping"].path.endswith("import.toml")
     episode = read_log(stage.output("log"))
     assert episode.metadata["pipeline"] == "rig"
     np.testing.assert_array_equal(episode.steps["sensor"].start, foreign_files.STAMPS_US)

@@ -18,7 +18,7 @@ FINALISER = """
 import gc, sys, time
 from types import ModuleType
 from sim2real import cli
-from sim2real.artifacts.run import run_folder
+from sim2real.artifacts import run as run_folder
 
 class Slow:
     def __del__(self):
@@ -75,7 +75,7 @@ import sys, time
 from pathlib import Path
 from types import ModuleType
 from sim2real import cli
-from sim2real.artifacts.run import run_folder
+from sim2real.artifacts import run as run_folder
 
 def run(pipeline, config, root, run_dir):
     with run_folder.open_stage(root, pipeline.name, "record", config) as stage:
@@ -124,7 +124,7 @@ import sys, time
 from types import ModuleType
 import jax, jax.numpy as jnp
 from sim2real import cli
-from sim2real.artifacts.run import run_folder
+from sim2real.artifacts import run as run_folder
 
 def run(pipeline, config, root, run_dir):
     with run_folder.open_stage(root, pipeline.name, "train", config, run_dir=run_dir):

@@ -18,8 +18,7 @@ from live_robots import assert_torque_ends_off, make_bundle, manifest_of
 from patience import PATIENT, wait_until_running
 
 from sim2real import cli, errors
-from sim2real.artifacts.run.manifest import read_manifest
-from sim2real.artifacts.run.run_folder import newest
+from sim2real.artifacts.run import StageFolder, newest
 from sim2real.emulation.truth import Kind, read_truth
 from sim2real.log.reader import TruncatedLogWarning, read_log
 
@@ -67,9 +66,9 @@ def test_a_killed_recording_leaves_what_was_written(tmp_path, lone_robot, start_
     log = wait_until_running(tmp_path, LOG, process)
     process.kill()
     process.wait()
-    manifest = read_manifest(log.parent)
-    assert manifest is not None
-    assert manifest["status"] == "died"
+    stage = StageFolder.read(log.parent)
+    assert stage is not None
+    assert stage.manifest.status == "died"
     with pytest.warns(TruncatedLogWarning, match="has no end"):
         episode = read_log(log)
     # Each command that reached the motor in this time stands in the log.

@@ -10,8 +10,7 @@ import numpy as np
 from sim2real.artifacts.bundle import History
 from sim2real.artifacts.deployment import Advice, Changed, Deployment, Drift, Gap, Scores
 from sim2real.artifacts.identification import ROUND_TRIP, Estimate, Identification, Judgement
-from sim2real.artifacts.run.run_folder import STAGES, Source, attempts, newest, open_stage
-from sim2real.artifacts.run.stage_status import TAKES
+from sim2real.artifacts.run import STAGES, TAKES, Source, attempts, newest, open_stage
 from sim2real.commands.loop import run_all
 from sim2real.commands.run import RunFlags
 from sim2real.errors import Sim2RealError
@@ -91,11 +90,12 @@ class Stages:
         if self.die == (call, when):
             os.kill(os.getpid(), signal.SIGKILL)
 
-    def run(self, iterations=5, resume=None, train=None, **told):
+    def run(self, iterations=5, resume=None, train=None, deploy=None, **told):
         """Run; return the run folder."""
         pipeline = load_pipeline("pendulum")
         stages = {stage: getattr(pipeline, stage) for stage in STAGES}
         stages["train"] = replace(pipeline.train, **(train or {}))
+        stages["deploy"] = deploy or pipeline.deploy
         flags = RunFlags(iterations=iterations, runs=self.root, resume=resume, **stages, **told)
         run_all(pipeline, flags, self)
         (run_dir,) = (self.root / "pendulum").iterdir()

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from sim2real.artifacts.bundle import Bundle
-from sim2real.artifacts.run.manifest import sha256
-from sim2real.artifacts.run.run_folder import StageFolder
+from sim2real.artifacts.run import Manifest, Source, StageFolder, sha256
 from sim2real.errors import DelayChanged, Sim2RealError
 from sim2real.policy import PolicyContract, save_bundle
 from sim2real.robots.probe import StepAnswers, Witness
@@ -129,8 +128,8 @@ def test_weights_that_are_no_numbers_or_absurd_are_refused(arm, value, said):
 def test_a_bundle_that_its_training_did_not_write_is_refused(arm, tmp_path):
     contract = contract_of(arm)
     path = save_bundle(tmp_path / "train" / "bundle", still(contract), contract)
-    outputs = {"bundle": {"path": "bundle", "sha256": sha256(path)}}
-    trained = StageFolder(path.parent, {"outputs": outputs})
+    outputs = {"bundle": Source("bundle", sha256(path))}
+    trained = StageFolder(path.parent, Manifest("arm", "train", "finished", "", outputs=outputs))
     preflight.require_untouched(trained)
     about = json.loads((path / "policy.json").read_text())  # the hashes in it still fit: only the manifest tells
     (path / "policy.json").write_text(json.dumps({**about, "rate_hz": 51.0}))

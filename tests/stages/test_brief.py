@@ -51,7 +51,7 @@ def test_each_second_prints_a_dot(capsys, monkeypatch):
 @pytest.mark.parametrize("verbose", [False, pytest.param(True, marks=pytest.mark.night)])
 def test_the_demo_prints_at_most_25_lines(verbose, monkeypatch, tmp_path, capsys, run_copy):
     """The stages' artifacts are those of a finished run; each stage prints 100 lines of details."""
-    from sim2real.artifacts.run.run_folder import finished
+    from sim2real.artifacts.run import finished
     from sim2real.commands import run
 
     def call_stage(stage, pipeline, config, root, run_dir, page=True):

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from sim2real import cli, errors
+from sim2real.artifacts import run as run_folder
 from sim2real.artifacts.identification import Estimate, Identification, Judgement
 from sim2real.artifacts.posterior import Posterior
-from sim2real.artifacts.run import run_folder
 from sim2real.commands.export import find_parameters
 from sim2real.identification.export import terms
 from sim2real.stages.pipeline.pipeline import load_pipeline

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sim2real.artifacts.recording import Recording
-from sim2real.artifacts.run.run_folder import Source
+from sim2real.artifacts.run import Source
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
 from sim2real.identification.model import Channel

@@ -8,9 +8,9 @@ from dataclasses import replace
 import pytest
 from loop_stages import Stages
 
-from sim2real.artifacts.run.iterations import Iterations
-from sim2real.artifacts.run.run_folder import STAGES, attempts, finished, open_stage
-from sim2real.artifacts.run.stage_status import stage_status
+from sim2real.artifacts.iterations import iterations
+from sim2real.artifacts.run import STAGES, attempts, finished, open_stage, stage_status
+from sim2real.errors import UsageError
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 
@@ -38,8 +38,8 @@ def quick(tmp_path, monkeypatch):
 
 def ran(run_dir):
     """What a run did: the finished attempts by stage with their seeds, and its rows without folders."""
-    done = {s: [a.manifest["config"]["seed"] for a in reversed(attempts(run_dir, s)) if a.finished] for s in STAGES}
-    return done, [(r.number, r.verdict, r.then, len(r.stages)) for r in Iterations.load(run_dir).rows]
+    done = {s: [a.manifest.config["seed"] for a in reversed(attempts(run_dir, s)) if a.finished] for s in STAGES}
+    return done, [(r.verdict, r.why, len(r.stages)) for r in iterations(run_dir)]
 
 
 @pytest.mark.night
@@ -58,7 +58,6 @@ def test_a_run_that_is_killed_at_any_stage_ends_as_if_it_had_not_been(tmp_path, 
             again.run(resume=run_dir)
             assert ran(run_dir) == expected, (call, when)
             assert len(again.calls) == calls - call - (when == "after"), "no stage that finished runs again"
-            assert Iterations.load(run_dir).plan is None
 
 
 def test_a_killed_run_whose_own_logs_do_not_suffice_records_and_does_not_repeat_that(tmp_path):
@@ -66,26 +65,24 @@ def test_a_killed_run_whose_own_logs_do_not_suffice_records_and_does_not_repeat_
     run_dir = killed(Stages(tmp_path / "runs", lacking=(1, 2)), 6, "within")
     again = Stages(tmp_path / "runs", lacking=(1, 2))
     again.run(resume=run_dir)
-    assert [stage for stage, _ in again.calls] == ["identify", "identify", "train", "deploy"]
-    assert [len(attempts(run_dir, s)) for s in STAGES] == [2, 5, 2, 2]
+    assert [stage for stage, _ in again.calls] == ["identify", "train", "deploy"]
+    assert [len(attempts(run_dir, s)) for s in STAGES] == [2, 4, 2, 2]
 
 
-def test_the_plan_is_on_disk_before_the_iteration_starts(tmp_path):
-    run_dir = killed(Stages(tmp_path / "runs"), 4, "within")
-    left = Iterations.load(run_dir)
-    assert [r.number for r in left.rows] == [1]
-    assert left.plan is not None
-    assert left.plan.stages == ("identify", "train", "deploy")
-    assert left.plan.log == ("deploy/episode_0.mcap", "record/session.mcap")
-    assert (left.plan.seed, left.plan.before) == (1, STAGES)
+def test_a_killed_run_does_not_train_on_logs_that_do_not_suffice(tmp_path):
+    """Killed in the recording that follows from them."""
+    run_dir = killed(Stages(tmp_path / "runs", lacking=(1,)), 5, "within")
+    again = Stages(tmp_path / "runs")
+    again.run(resume=run_dir)
+    assert [stage for stage, _ in again.calls] == list(STAGES)
+    assert dict(again.calls)["identify"].log == ()
 
 
-def test_a_run_without_iterations_says_that_one_was_interrupted(tmp_path, capsys):
-    run_dir = killed(Stages(tmp_path / "runs", ("re-train", "fine")), 4, "within")
-    once = Stages(tmp_path / "runs")
-    once.run(iterations=1, resume=run_dir)
-    assert once.calls == []
-    assert "an iteration of this run was interrupted (train with another seed, deploy)" in capsys.readouterr().err
+def test_a_dry_deployment_is_refused_before_anything_moves(tmp_path):
+    stages = Stages(tmp_path / "runs")
+    with pytest.raises(UsageError, match="dry"):
+        stages.run(deploy=replace(load_pipeline("pendulum").deploy, dry_run=True))
+    assert stages.calls == []
 
 
 def test_a_deployment_has_one_row_however_often_its_run_is_resumed(tmp_path):
@@ -93,11 +90,9 @@ def test_a_deployment_has_one_row_however_often_its_run_is_resumed(tmp_path):
     run_dir = stages.run(iterations=2)
     for _ in range(2):
         stages.run(iterations=2, resume=run_dir)
-    assert [r.number for r in Iterations.load(run_dir).rows] == [1, 2]
+    assert len(iterations(run_dir)) == 2
     stages.run(iterations=3, resume=run_dir)
-    assert [(r.number, r.verdict) for r in Iterations.load(run_dir).rows] == [
-        (1, "re-train"), (2, "re-train"), (3, "fine"),
-    ]  # fmt: skip
+    assert [r.verdict for r in iterations(run_dir)] == ["re-train", "re-train", "fine"]
 
 
 @pytest.mark.parametrize("iterations", [1, 3])

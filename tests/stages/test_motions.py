@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sim2real import cli
-from sim2real.artifacts.run.run_folder import newest
+from sim2real.artifacts.run import newest
 from sim2real.errors import UsageError
 from sim2real.log.reader import read_log
 from sim2real.stages.excitation.played import played

@@ -13,8 +13,7 @@ import pytest
 
 from sim2real.artifacts.identification import Identification, Judgement
 from sim2real.artifacts.recording import Recording
-from sim2real.artifacts.run.manifest import sha256
-from sim2real.artifacts.run.run_folder import attempts
+from sim2real.artifacts.run import attempts, sha256
 from sim2real.errors import Sim2RealError
 from sim2real.stages.identify import fitting
 from sim2real.stages.identify import stage as identify_stage
@@ -53,7 +52,7 @@ def interrupted(pipeline, root, monkeypatch, ending, told=True):
 @pytest.mark.parametrize(("ending", "code"), [(KeyboardInterrupt(), 130), (SystemExit(143), 143)])
 def test_the_best_so_far_is_left_and_says_what_it_is(pendulum, tmp_path, monkeypatch, ending, code):
     stage = interrupted(pendulum, tmp_path, monkeypatch, ending)
-    assert (stage.manifest["status"], stage.manifest["exit_code"]) == ("interrupted", code)
+    assert (stage.manifest.status, stage.manifest.exit_code) == ("interrupted", code)
     path = stage.output("partial")
     document = json.loads(path.read_text())
     assert document["verdict"]["status"] == "not finished"
@@ -70,7 +69,7 @@ def test_nothing_is_left_where_nothing_was_found_or_something_else_went_wrong(pe
     stage = interrupted(pendulum, tmp_path / "early", monkeypatch, KeyboardInterrupt(), told=False)
     assert not (stage.folder / "partial.json").exists()
     stage = interrupted(pendulum, tmp_path / "error", monkeypatch, ValueError("broken"))
-    assert stage.manifest["status"] == "failed"
+    assert stage.manifest.status == "failed"
     assert not (stage.folder / "partial.json").exists()
 
 
@@ -94,7 +93,7 @@ def test_an_error_in_the_judgement_leaves_the_fit(pendulum, tmp_path, monkeypatc
         identify_stage.run(pendulum, replace(pendulum.identify, log=(str(LOG),)), tmp_path, None)
     (run,) = (tmp_path / "pendulum").iterdir()
     stage = attempts(run, "identify")[0]
-    assert stage.manifest["status"] == "failed"
+    assert stage.manifest.status == "failed"
     assert Identification.load(stage.output("partial")).values["gain"] == pytest.approx(21.0, rel=1e-4)
     assert "--begin" in capsys.readouterr().err
 

@@ -9,7 +9,7 @@ import pytest
 
 from sim2real import cli
 from sim2real.artifacts.bundle import Bundle
-from sim2real.artifacts.run.run_folder import open_stage
+from sim2real.artifacts.run import open_stage
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.stages.train import resume, stage

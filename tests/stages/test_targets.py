@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from sim2real.artifacts.run import run_folder
+from sim2real.artifacts import run as run_folder
 from sim2real.errors import SafetyStop, UsageError
 from sim2real.stages.config import RecordConfig
 from sim2real.stages.pipeline import find_run

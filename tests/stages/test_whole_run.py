@@ -15,7 +15,7 @@ import sim2real
 from sim2real import cli
 from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.episodes import Episodes
-from sim2real.artifacts.run.run_folder import STAGES
+from sim2real.artifacts.run import STAGES
 from sim2real.errors import UsageError
 
 NOTEBOOK = Path(__file__).parents[2] / "docs" / "guides" / "notebook.md"

@@ -17,7 +17,7 @@ from sim2real.artifacts.bundle import History
 from sim2real.artifacts.deployment import Deployment
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.recording import Recording
-from sim2real.artifacts.run.run_folder import finished_stages
+from sim2real.artifacts.run import finished_stages
 from sim2real.view import identification, sections, style, timing
 from sim2real.view.signals import ComparedSeries, Series, pairs_of, signals_of, simulated_series
 

@@ -10,7 +10,7 @@ import pytest
 from live_robots import manifest_of
 
 from sim2real import cli
-from sim2real.artifacts.run.run_folder import newest
+from sim2real.artifacts.run import newest
 from sim2real.errors import UsageError
 from sim2real.log.reader import read_log
 from sim2real.stages.live.config import check_view

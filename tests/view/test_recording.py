@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import synthetic_run
 
-from sim2real.artifacts.run.run_folder import finished_stages
+from sim2real.artifacts.run import finished_stages
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import StepRecord, steps_from_records
 from sim2real.stages.pipeline.pipeline import load_pipeline

@@ -18,7 +18,7 @@ from benches.rows import Report, Row, row
 
 from sim2real.artifacts.files import plain
 from sim2real.artifacts.identification import Identification
-from sim2real.artifacts.run.run_folder import STAGES, StageFolder, finished
+from sim2real.artifacts.run import STAGES, StageFolder, finished
 
 
 def add_flags(parser: argparse.ArgumentParser, seeds: list[int]) -> None:
@@ -57,7 +57,7 @@ def whole_run(pipeline: str, seed: int, runs: Path, flags: list[str]) -> tuple[P
     sim2real("run", pipeline, "--seed", str(seed), "--runs", str(runs), *flags)
     result: dict[str, Any] = {"seed": seed, "total_s": time.monotonic() - begin}
     run_dir = next((runs / pipeline).iterdir())
-    result |= {f"{stage}_s": done(run_dir, stage).manifest["duration_s"] for stage in STAGES}
+    result |= {f"{stage}_s": done(run_dir, stage).manifest.duration_s for stage in STAGES}
     return run_dir, result | estimates(done(run_dir, "identify"))
 
 

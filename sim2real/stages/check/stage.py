@@ -15,7 +15,7 @@ import numpy as np
 
 from sim2real import pytree
 from sim2real.artifacts.files import number, plain, to_json
-from sim2real.artifacts.run.run_folder import newest
+from sim2real.artifacts.run import newest
 from sim2real.artifacts.summary import ArtifactTable, Shown
 from sim2real.errors import NotInstalled, Sim2RealError, UsageError
 from sim2real.graph.episode import Episode

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sim2real.artifacts.deployment import Advice, Deployment, Drift
 from sim2real.artifacts.identification import Identification
-from sim2real.artifacts.run.manifest import MANIFEST
+from sim2real.artifacts.run import MANIFEST
 from sim2real.robots.robot import in_world
 from sim2real.stages.deploy.trajectories import PAUSED
 from sim2real.stages.pipeline.pipeline import Pipeline

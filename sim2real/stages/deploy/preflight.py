@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from sim2real.artifacts.bundle import Bundle
-from sim2real.artifacts.run.manifest import sha256
-from sim2real.artifacts.run.run_folder import StageFolder, newest
+from sim2real.artifacts.run import StageFolder, newest, sha256
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.policy.contract import ActionTerm, ObservationTerm
 from sim2real.robots.robot import Robot
@@ -44,7 +43,7 @@ def require_untouched(training: StageFolder) -> None:
     Raises:
         Sim2RealError: The hashes differ.
     """
-    path, written = training.output("bundle"), training.manifest["outputs"]["bundle"].get("sha256")
+    path, written = training.output("bundle"), training.manifest.outputs["bundle"].sha256
     if sha256(path) != written:
         raise Sim2RealError(
             f"{path} is not the bundle that its training wrote: its hash is not the one in the manifest",

@@ -10,7 +10,7 @@ from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.deployment import PROBE, Deployment, Scores, log_of
 from sim2real.artifacts.identification import ROUND_TRIP, Identification
 from sim2real.artifacts.recording import TRUTH, Recording
-from sim2real.artifacts.run.run_folder import StageFolder, finished, open_stage
+from sim2real.artifacts.run import StageFolder, finished, open_stage
 from sim2real.errors import UsageError
 from sim2real.hardware.safety.following import Following
 from sim2real.installation import has_jax

@@ -11,7 +11,7 @@ from pathlib import Path
 import sim2real
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.recording import Recording
-from sim2real.artifacts.run.run_folder import Source, portable
+from sim2real.artifacts.run import Source, portable
 from sim2real.errors import OtherMotion
 from sim2real.graph.episode import Episode
 from sim2real.identification.delays import measured

@@ -16,7 +16,7 @@ import numpy as np
 
 from sim2real.artifacts.identification import Estimate, Identification, Judgement, Search
 from sim2real.artifacts.progress import write_best_fit, write_progress
-from sim2real.artifacts.run.run_folder import OpenStage
+from sim2real.artifacts.run import OpenStage
 from sim2real.identification.fit import as_numbers
 from sim2real.identification.parameters import ParameterTable
 from sim2real.identification.predictions import samples

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from sim2real.artifacts.identification import PARAMETERS, Identification
-from sim2real.artifacts.run.run_folder import OpenStage, StageFolder, newest, open_stage
+from sim2real.artifacts.run import OpenStage, StageFolder, newest, open_stage
 from sim2real.errors import UsageError
 from sim2real.identification.held_out import REFITS
 from sim2real.identification.uncertainty import noises

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sim2real.artifacts.run import run_folder
+from sim2real.artifacts import run as run_folder
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sim2real.artifacts.files import plain
-from sim2real.artifacts.run.manifest import git_state, versions
+from sim2real.artifacts.run import git_state, versions
 from sim2real.errors import ERROR, OK, DeadlineExceeded, SafetyStop, Sim2RealError
 from sim2real.graph.base import GraphState
 from sim2real.graph.episode import MessageRecord, Recorder, StepRecord, named_leaves

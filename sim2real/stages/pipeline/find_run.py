@@ -3,9 +3,7 @@
 import difflib
 from pathlib import Path
 
-from sim2real.artifacts.run.manifest import read_manifest
-from sim2real.artifacts.run.run_folder import STAGES, StageFolder, attempts, finished, run_folders
-from sim2real.artifacts.run.stage_status import stage_status, why_stale
+from sim2real.artifacts.run import STAGES, StageFolder, attempts, finished, run_folders, stage_status, why_stale
 from sim2real.errors import UsageError
 from sim2real.stages.pipeline.pipeline import available
 from sim2real.stages.terminal.console import note
@@ -21,10 +19,10 @@ def find_run(root: Path, target: str | Path, pipeline: str | None = None) -> Pat
     """
     path = Path(target)
     # Only a stage folder selects its parent: that of a pipeline's name would be the working directory.
-    options = [path.parent if read_manifest(path) is not None else path]
+    options = [path.parent if StageFolder.read(path) is not None else path]
     options += [Path(root) / pipeline / path] if pipeline else sorted(Path(root).glob(f"*/{path.name}"))
     for folder in options:
-        owners = {str(a.manifest.get("pipeline")) for stage in STAGES for a in attempts(folder, stage)}
+        owners = {a.manifest.pipeline for stage in STAGES for a in attempts(folder, stage)}
         if owners and pipeline and pipeline not in owners:
             raise UsageError(f"{folder} is a run of {', '.join(sorted(owners))}, not of {pipeline}")
         if owners:
@@ -37,7 +35,7 @@ def find_run(root: Path, target: str | Path, pipeline: str | None = None) -> Pat
 def warn_of_stale(folder: StageFolder) -> StageFolder:
     """Return a finished stage that is taken up; print a warning where its run has a newer input of it."""
     if why := why_stale(folder, stage_status(folder.run_dir)):
-        note(f"warning: {why}; `sim2real run {folder.manifest['pipeline']} --resume {folder.run_dir}` makes it again")
+        note(f"warning: {why}; `sim2real run {folder.manifest.pipeline} --resume {folder.run_dir}` makes it again")
     return folder
 
 

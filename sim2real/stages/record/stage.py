@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sim2real.artifacts.recording import LOG, TRUTH, Recording
-from sim2real.artifacts.run.run_folder import StageFolder, open_stage
+from sim2real.artifacts.run import StageFolder, open_stage
 from sim2real.installation import has_jax
 from sim2real.robots.robot import Robot
 from sim2real.stages.check.config import CheckConfig

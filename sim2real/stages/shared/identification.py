@@ -16,7 +16,7 @@ import numpy as np
 
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.recording import Recording
-from sim2real.artifacts.run.manifest import sha256
+from sim2real.artifacts.run import sha256
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
 from sim2real.identification.model import IdentifiableModel, position_of

@@ -7,8 +7,7 @@ from pathlib import Path
 from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.recording import Recording
-from sim2real.artifacts.run.manifest import sha256
-from sim2real.artifacts.run.run_folder import newest
+from sim2real.artifacts.run import newest, sha256
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.stages.pipeline.find_run import warn_of_stale

@@ -4,8 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from sim2real.artifacts.run.manifest import RUNNING, read_manifest, sha256
-from sim2real.artifacts.run.run_folder import StageFolder, attempts, run_folders
+from sim2real.artifacts.run import RUNNING, StageFolder, attempts, run_folders, sha256
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.stages.pipeline.find_run import find_run
 from sim2real.stages.terminal.console import note, shown
@@ -35,8 +34,8 @@ def find_interrupted(pipeline: str, config: TrainConfig, root: Path) -> StageFol
 
 def check_same_parameters(interrupted: StageFolder, path: Path | None) -> None:
     """Raise a ``UsageError`` if the parameters at ``path`` differ from those of the interrupted training."""
-    before = interrupted.manifest.get("inputs", {}).get("parameters", {}).get("sha256")
-    if before != (None if path is None else sha256(path)):
+    before = interrupted.manifest.inputs.get("parameters")
+    if (before and before.sha256) != (None if path is None else sha256(path)):
         raise UsageError(
             f"{interrupted.folder} trains on other parameters than {path or 'the nominal ones'}",
             hint="give the parameters of the interrupted training by --parameters, or drop --resume",
@@ -59,22 +58,22 @@ def resumable(folder: Path) -> Iterator[Path]:
 def _newest_unfinished(pipeline: str, target: str, root: Path) -> StageFolder | None:
     """Return the newest unfinished training in a run, in a pipeline's runs, or the one of a stage's folder."""
     # List the trainings at the target.
-    manifest = read_manifest(Path(target))
-    if manifest is not None and manifest["stage"] == "train":
-        trainings = [StageFolder(Path(target), manifest)]
-        if manifest["pipeline"] != pipeline:
-            raise UsageError(f"{target} is a training of {manifest['pipeline']}, not of {pipeline}")
+    named = StageFolder.read(Path(target))
+    if named is not None and named.stage == "train":
+        trainings = [named]
+        if named.manifest.pipeline != pipeline:
+            raise UsageError(f"{target} is a training of {named.manifest.pipeline}, not of {pipeline}")
     else:
         runs = run_folders(root, pipeline) if target == NEWEST else [find_run(root, target, pipeline)]
         trainings = [attempt for run in runs for attempt in attempts(run, "train")]
 
     # Drop finished ones, and those that still run.
     unfinished = [attempt for attempt in trainings if not attempt.finished]
-    busy = [a.folder for a in unfinished if a.manifest["status"] == RUNNING]
+    busy = [a.folder for a in unfinished if a.manifest.status == RUNNING]
     if busy and len(busy) == len(unfinished):
         raise UsageError(
             f"the training in {busy[0]} is still running: two processes would write the same policy",
             hint="wait until it has ended, or end it by Ctrl-C, and resume it then",
         )
     unfinished = [attempt for attempt in unfinished if attempt.folder not in busy]
-    return max(unfinished, key=lambda a: str(a.manifest.get("started", "")), default=None)
+    return max(unfinished, key=lambda a: a.manifest.started, default=None)

@@ -11,7 +11,7 @@ import jax
 
 from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.identification import Identification
-from sim2real.artifacts.run.run_folder import StageFolder, open_stage
+from sim2real.artifacts.run import StageFolder, open_stage
 from sim2real.robots.robot import Robot
 from sim2real.stages.pipeline import python_arguments
 from sim2real.stages.pipeline.pipeline import Pipeline, pipeline_of

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sim2real.artifacts.progress import write_progress
-from sim2real.artifacts.run.run_folder import OpenStage
+from sim2real.artifacts.run import OpenStage
 from sim2real.errors import Sim2RealError
 from sim2real.installation import with_extra
 from sim2real.stages.live.viewer import live_view

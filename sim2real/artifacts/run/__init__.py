@@ -1,1 +1,0 @@
-"""The run folder: manifests, locks, the status of stages, iterations."""
