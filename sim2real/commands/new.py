@@ -292,5 +292,5 @@ def _ask(question: str) -> None:
     print(question, end="", file=sys.stderr, flush=True)
     if not sys.stdin.readline():
         raise UsageError(
-            "there was no answer, so the arm was not recorded", hint="sim2real record NAME records it later"
+            "there was no answer, so the arm was not recorded", hint="`sim2real record NAME` records it later"
         )

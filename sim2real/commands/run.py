@@ -62,7 +62,7 @@ class RunFlags(DemoFlags):
         if self.train.hosts.several:
             raise UsageError(
                 "only training is divided among processes: each of them would record and deploy",
-                hint="record and identify in one, then `sim2real train PIPELINE --hosts...` in all",
+                hint="record and identify in one, then `sim2real train PIPELINE --hosts.found` in all",
             )
         if self.iterations < 1 or (self.until and self.iterations == 1):
             raise UsageError(

@@ -63,7 +63,9 @@ def open_viewer(recording: Any, target: str) -> str:
         raise
     except (OSError, RuntimeError, ValueError) as error:
         reason = f"cannot write {target}" if target.endswith(".rrd") else "cannot open the Rerun viewer"
-        raise Sim2RealError(f"{reason}: {error}", hint="save it with --save FILE.rrd and open that") from error
+        raise Sim2RealError(
+            f"{reason}: {error}", hint="FILE.rrd in the place of the viewer writes a file, which the viewer opens later"
+        ) from error
 
 
 def rerun_module() -> Any:

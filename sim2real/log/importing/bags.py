@@ -100,7 +100,8 @@ def _messages(path: Path, table: Table) -> Iterator[tuple[str, Schema | None, by
                     channels[record.id] = record
                 elif isinstance(record, Metadata) and record.name == SESSION:
                     raise UsageError(
-                        f"{path} is a log of sim2real, which needs no import", hint=f"sim2real identify --log {path}"
+                        f"{path} is a log of sim2real, which needs no import",
+                        hint=f"sim2real identify PIPELINE --log {path}",
                     )
         except UsageError:
             raise

@@ -75,6 +75,9 @@ class TrainConfig(LearningConfig):
                 f"training needs at least one timeline of 0.5 to 600 s, got {self.timelines} of {self.episode_s} s"
             )
         if self.explain and self.hosts.several:
-            raise UsageError("explain trains nothing: it takes one process", hint="remove --hosts")
+            raise UsageError(
+                "explain trains nothing: it takes one process",
+                hint="run it in one process, without --hosts.found and --hosts.processes",
+            )
         if not 0.0 <= self.randomise <= 10.0:
             raise UsageError(f"randomise must lie in [0, 10], got {self.randomise}")
