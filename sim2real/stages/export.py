@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -13,11 +13,10 @@ from sim2real.artifacts.identification import UNFINISHED, Identification
 from sim2real.artifacts.run import sha256
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
-from sim2real.identification.export.card import differing, write_card
-from sim2real.identification.export.document import json_document
+from sim2real.identification.export.card import differing, json_document, write_card
 from sim2real.identification.export.mjcf import Late, late_mjcf
-from sim2real.identification.export.targets import isaaclab_source, mjlab_source
-from sim2real.identification.export.terms import Terms, find_delays, find_terms, values_of
+from sim2real.identification.export.targets import source_of
+from sim2real.identification.export.terms import find_delays, find_terms, values_of
 from sim2real.identification.model import IdentifiableModel
 from sim2real.identification.parameters import ParameterTable
 from sim2real.installation import version
@@ -90,11 +89,13 @@ def write_export(
     text = robot.identified_mjcf({**off, **values_of(identification)})
     terms = None if text is None else find_terms(identification, lambda values: _text(robot, {**off, **values}), sides)
     # Write the format: JSON and a card need no model, the others need one.
-    if to == "json":
-        write_json(out, json_document(identification, terms, find_delays(identification, sides), about))
-        return
-    if to == "card":
-        write_model_card(out, identification, robot, model, terms, about, run_dir)
+    if to in ("json", "card"):
+        about = about if to == "json" else [row for row in about if row[0] != "log"]  # no path of this machine
+        document = json_document(identification, terms, find_delays(identification, sides), about)
+        if to == "json":
+            write_json(out, document)
+        else:
+            write_model_card(out, identification, robot, model, document, run_dir)
         return
     if text is None or terms is None:
         raise _no_model(identification, model.parameters, to)
@@ -105,7 +106,7 @@ def write_export(
         content = late_mjcf(text, terms, Late(robot.export_lead_s, robot.profile_rad_s), about)
     else:
         title = f"Actuators and randomisation of {identification.pipeline!r}, as sim2real identified them."
-        content = (mjlab_source if to == "mjlab" else isaaclab_source)(terms, title, about)
+        content = source_of(to, terms, title, about)
     out.write_text(content, encoding="utf-8")
 
 
@@ -114,13 +115,13 @@ def write_model_card(
     identification: Identification,
     robot: RecordedRobot,
     model: IdentifiableModel,
-    terms: Terms | None,
-    about: Sequence[tuple[str, str]],
+    document: Mapping[str, Json],
     run_dir: Path | None,
 ) -> None:
     """Write the card of an identification, and a note for each figure that plain MuJoCo misses.
 
     Args:
+        document: The results, as ``json_document`` returns them.
         run_dir: Folder of the run, in which the log lies; None: the card has no facts about the hardware.
 
     Raises:
@@ -129,10 +130,9 @@ def write_model_card(
     if folder.is_file() or (folder.is_dir() and any(folder.iterdir()) and not (folder / "card.json").is_file()):
         raise UsageError(f"{folder} is there and holds no model card", hint="name another folder with --out")
     plain = robot.plain_simulation({p.name: p.nominal for p in model.parameters} | values_of(identification))
-    about = [row for row in about if row[0] != "log"]  # a path of the own machine is no part of a card
-    delays = find_delays(identification, {p.name: p.side for p in model.parameters})
-    session = _session(identification, SENSOR, run_dir)
-    card, signals = write_card(folder, identification, model, plain, terms, delays, about, session)
+    card, signals = write_card(
+        folder, identification, model, plain, document, _session(identification, SENSOR, run_dir)
+    )
     for sentence in [*card["notes"], *differing(folder)]:
         note(sentence)
     from sim2real.view.model_card import model_card_page  # matplotlib and jinja2 take 0.5 s to import

@@ -13,16 +13,6 @@ from sim2real.view.identification import link_blocks
 from sim2real.view.page import write_page
 
 PAGE = "card.html"
-_RECIPES = {
-    "error": "{measure} of simulation less measurement of {field}, segments {run}, settle_s to {horizon_s:g} s later",
-    "quantile": "quantile {q:g} of {signal}",
-    "interval": "{scale} scale: mean {mean:.6g}, {deviations:+g} times the deviation {deviation:.4g}",
-    "distribution": "link {link}: mean of delays with their share, or the delay at q = {q}",
-    "sum": "estimates of {parameters} added",
-    "speed": "quantile {q:g} of the differences of {signal} over those of stamps",
-    "model": "{field} of the joint {joint} in model.xml",
-}
-"""Kind of a recipe -> its text."""
 
 
 def model_card_page(
@@ -54,10 +44,10 @@ def model_card_page(
     blocks.append(ListBlock("Not known", card["unknown"] or ["every parameter of the model was identified"]))
     blocks.append(ListBlock("Firmware, supply and temperature", [f"{n}: {v}" for n, v in card["session"].items()]))
     if card["simulation"]:
-        blocks.append(ListBlock("Equations of drives and delays", card["simulation"]["equations"]))
-        blocks.append(TableBlock.of("Numbers of these equations", _numbers(card["simulation"])))
+        caption = f"Numbers of the drives: the function {card['simulation']['law']} in reproduce.py"
+        blocks.append(TableBlock.of(caption, _numbers(card["simulation"])))
     blocks.append(ListBlock("Logs", [f"{log['name']}, SHA-256 {log['sha256']}" for log in card["logs"]]))
-    figures: list[list[Json]] = [[f["name"], f["value"], f["unit"], recipe_text(f["recipe"])] for f in card["figures"]]
+    figures: list[list[Json]] = [[f["name"], f["value"], f["unit"], _recipe(f["recipe"])] for f in card["figures"]]
     caption = "Figures: the motion and times that the log covers, and errors to expect"
     blocks.append(TableBlock.of(caption, ArtifactTable(("figure", "value", "unit", "recipe"), figures)))
     reasons = [sentence(reason) for reason in card["verdict"]["reasons"]]
@@ -69,10 +59,12 @@ def model_card_page(
     return write_page(folder / PAGE, about["pipeline"], [section], version=about["sim2real"])
 
 
-def recipe_text(recipe: Mapping[str, Json]) -> str:
+def _recipe(recipe: Mapping[str, Json]) -> str:
     """Return a recipe of ``card.json`` as text."""
-    texts = {name: ", ".join(value) if isinstance(value, list) else value for name, value in recipe.items()}
-    return _RECIPES[recipe["kind"]].format(**texts)
+    if "signal" in recipe:
+        return f"quantile {recipe['q']:g} of {recipe['signal']}"
+    field, run, horizon_s = (recipe[name] for name in ("field", "run", "horizon_s"))
+    return f"simulation less measurement of {field}, segments {run}, settle_s to {horizon_s:g} s later"
 
 
 def _numbers(simulation: Mapping[str, Json]) -> ArtifactTable:

@@ -8,7 +8,7 @@ import pytest
 
 from sim2real.errors import UsageError
 from sim2real.identification.export.mjcf import Late, late_mjcf
-from sim2real.identification.export.targets import isaaclab_source, mjlab_source
+from sim2real.identification.export.targets import TARGETS, source_of
 from sim2real.identification.export.terms import Delays, Term, Terms
 
 NAMES = ("arm/pan/joint", "tilt.joint")
@@ -102,7 +102,7 @@ def check_events(events):
 
 
 def test_mjlab_takes_the_file(terms, simulators):
-    made = executed(mjlab_source(terms, "An arm.", ABOUT))
+    made = executed(source_of("mjlab", terms, "An arm.", ABOUT))
     first, second = made.ACTUATORS
     assert (first.stiffness, first.armature, first.effort_limit) == (4.0, 0.01, 1.4)
     assert not hasattr(second, "effort_limit")
@@ -117,7 +117,7 @@ def test_mjlab_takes_the_file(terms, simulators):
 
 
 def test_isaac_lab_takes_the_file(terms, simulators):
-    made = executed(isaaclab_source(terms, "An arm.", ABOUT))
+    made = executed(source_of("isaaclab", terms, "An arm.", ABOUT))
     own = made.ACTUATORS["identified"]
     assert (own.kind, own.min_delay, own.max_delay) == ("late", 6, 8)
     assert own.viscous_friction == {NAMES[0]: 0.05, r"tilt\.joint": 0.05}
@@ -137,16 +137,16 @@ def test_without_delays_and_intervals_there_is_nothing_to_randomise(terms, simul
         n: {k: Term(t.estimate, t.estimate, t.estimate) for k, t in own.items()} for n, own in terms.joints.items()
     }
     bare = Terms(known, {}, Delays(), 0.0025, ())
-    assert executed(mjlab_source(bare, "", ABOUT)).EVENTS == {}
-    made = executed(isaaclab_source(bare, "", ABOUT))
+    assert executed(source_of("mjlab", bare, "", ABOUT)).EVENTS == {}
+    made = executed(source_of("isaaclab", bare, "", ABOUT))
     assert made.ACTUATORS["identified"].kind == "implicit"
 
 
-@pytest.mark.parametrize("source", [mjlab_source, isaaclab_source])
-def test_motors_are_refused_by_name(terms, source):
+@pytest.mark.parametrize("target", TARGETS)
+def test_motors_are_refused_by_name(terms, target):
     motor = {"wheel": {"damping": Term(0, 0, 0), "gain": Term(1, 1, 1)}}
     with pytest.raises(UsageError, match="the actuators of wheel take other commands"):
-        source(Terms({**terms.joints, **motor}, {}, Delays(), 0.01, ()), "", ABOUT)
+        source_of(target, Terms({**terms.joints, **motor}, {}, Delays(), 0.01, ()), "", ABOUT)
 
 
 XML = """

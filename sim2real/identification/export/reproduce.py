@@ -1,7 +1,8 @@
 """Compute the figures of a model card again: ``python reproduce.py`` needs numpy and mujoco, and this folder.
 
-``card.json`` holds the figures with their recipes and the equations of the drives, ``model.xml`` the robot, and
-``signals.npz`` the measurements and commands. Each line shows the card's figure, the value of this script, and by how
+``card.json`` holds the figures with their recipes and the numbers of the drives, ``model.xml`` the robot, and
+``signals.npz`` the measurements and commands. The functions ``held``, ``setpoint``, ``drive`` and ``verlet`` are the
+equations of the drives and of the integrator. Each line shows the card's figure, the value of this script, and by how
 much they differ.
 """
 
@@ -182,11 +183,13 @@ class Card:
         self._errors: dict[str, dict[str, np.ndarray]] = {}
 
     def value(self, recipe: Untyped) -> float:
-        """Return the number of a recipe of ``card.json``."""
-        return float(getattr(self, f"_{recipe['kind']}")(recipe))
+        """Return the number of a recipe of ``card.json``: a quantile of a signal, or an error of the simulation.
 
-    def _error(self, recipe: Untyped) -> float:
-        """Root mean square, or mean absolute value, of simulation less measurement up to a horizon."""
+        An error is the root mean square of simulation less measurement of a field, up to a horizon.
+        """
+        if "signal" in recipe:
+            values = self.signals[recipe["signal"]]
+            return float(np.quantile(values[np.isfinite(values)], recipe["q"]))
         run = recipe["run"]
         if run not in self._errors:
             self._errors[run] = predictions(self._xml, self.card["simulation"], self.signals, run)
@@ -194,40 +197,7 @@ class Card:
         pick = (ahead > 0) & (ahead <= recipe["horizon_s"])
         if "recording" in recipe:
             pick &= self.signals[f"{run}/recording"][self.signals[f"{run}/row"]] == recipe["recording"]
-        error = self._errors[run][recipe["field"]][pick]
-        return float(np.sqrt(np.mean(error**2)) if recipe["measure"] == "rmse" else np.mean(np.abs(error)))
-
-    def _quantile(self, recipe: Untyped) -> float:
-        """Quantile of recorded numbers."""
-        values = self.signals[recipe["signal"]]
-        return np.quantile(values[np.isfinite(values)], recipe["q"])
-
-    def _distribution(self, recipe: Untyped) -> float:
-        """Mean of the delays of a link, or the delay that a share ``q`` of the messages does not exceed."""
-        delays, share = (self.signals[f"link/{recipe['link']}/{name}"] for name in ("delays", "share"))
-        if recipe["q"] is None:
-            return share @ delays
-        return np.interp(recipe["q"], np.cumsum(share) - 0.5 * share, delays)
-
-    def _speed(self, recipe: Untyped) -> float:
-        """Quantile of the speed between two measurements of a field, without gaps of the log."""
-        took, moved = np.diff(self.signals["stamps"]), np.diff(self.signals[recipe["signal"]])
-        usual = (took > 0) & (took < 3 * np.median(took))
-        return np.quantile(np.abs(moved[usual] / took[usual]), recipe["q"])
-
-    def _interval(self, recipe: Untyped) -> float:
-        """End of the interval of a Normal distribution on the parameter's scale."""
-        x = recipe["mean"] + recipe["deviations"] * recipe["deviation"]
-        return {"linear": x, "log": math.exp(min(x, 700.0)), "logit": 1.0 / (1.0 + math.exp(-x))}[recipe["scale"]]
-
-    def _sum(self, recipe: Untyped) -> float:
-        """Sum of estimates."""
-        return sum(p["estimate"] for p in self.card["parameters"] if p["name"] in recipe["parameters"])
-
-    def _model(self, recipe: Untyped) -> float:
-        """Number of a joint in ``model.xml``."""
-        model = _mj.MjModel.from_xml_string(self._xml)
-        return getattr(model, recipe["field"])[int(model.joint(recipe["joint"]).dofadr[0])]
+        return float(np.sqrt(np.mean(self._errors[run][recipe["field"]][pick] ** 2)))
 
 
 def main() -> int:
