@@ -40,8 +40,7 @@ from sim2real.stages.check.stage import check as check
 from sim2real.stages.deploy.stage import deploy as deploy
 from sim2real.stages.export import export as export
 from sim2real.stages.identify.stage import identify as identify
-from sim2real.stages.pipeline.pipeline import Pipeline as Pipeline
-from sim2real.stages.pipeline.pipeline import load_pipeline as load_pipeline
+from sim2real.stages.load import load_robot as load_robot
 from sim2real.stages.record.stage import record as record
 from sim2real.stages.train.stage import train as train
 from sim2real.stages.validate.stage import validate as validate

@@ -7,7 +7,7 @@ import numpy as np
 from sim2real.emulation.truth import Kind
 from sim2real.hardware.device import OperatingMode
 from sim2real.policy import PolicyContract, save_bundle
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 
 TINY = [
     *("--identify.generations=10", "--identify.population=8", "--identify.folds=0"),
@@ -25,7 +25,7 @@ def manifest_of(folder):
 
 def make_bundle(name, folder, bias=0.0, slope=0.0):
     """Write a bundle whose policy gives the same action always, or one that grows with the third observation."""
-    robot = load_pipeline(name).load()
+    robot = load_robot(name)
     size, low, high = robot.agent.observation_size, *np.array([(a.low, a.high) for a in robot.agent.action]).T
     weights = {"mean": np.zeros(size), "std": np.ones(size), "low": low, "high": high, "log_std": np.zeros(len(low))}
     kernel = np.zeros((size, len(low)))

@@ -33,7 +33,7 @@ from sim2real.emulation.truth import Kind, TruthLog
 from sim2real.graph.episode import MessageRecord, StepRecord
 from sim2real.log.writer import McapRecorder
 from sim2real.stages.deploy import episodes
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 
 RECORD_S, VOLTS = 12.0, 2.0
 ROBOT = replace(hidden.Hidden.draw(1), jitter=0.0, lost=0.0, play=0.0)
@@ -47,8 +47,8 @@ SUMMARY = {
 
 def make(root: Path) -> Path:
     """Make a run with all four stages below ``root``; return its folder."""
-    pipeline = load_pipeline("pendulum")
-    config = replace(pipeline.record, duration_s=RECORD_S, seed=1)
+    pipeline = load_robot("pendulum")
+    config = replace(pipeline.defaults.record, duration_s=RECORD_S, seed=1)
     with open_stage(root, pipeline.name, "record", config) as stage:
         played = hidden.play(ROBOT, hidden.excited(RECORD_S, 0), RECORD_S, 0)
         write(stage.output("log", LOG), stage.output("truth", TRUTH), played)

@@ -18,7 +18,7 @@ from sim2real.artifacts import run as run_folder
 from sim2real.artifacts.identification import Identification, Judgement
 from sim2real.commands import flags, run, stages
 from sim2real.stages.config import RecordConfig
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import defaults_of
 from sim2real.stages.validate.config import ValidateConfig
 
 QUICK = {**os.environ, "PYTHONUNBUFFERED": "1"}
@@ -197,7 +197,7 @@ def test_a_range_replaces_one_of_the_pipeline_or_is_added_to_them(calls):
     ranges = ["--vary.range", "roughness", "0", "0.04", "--vary.range", "payload", "-2", "3"]
     assert cli.main(["train", "go2", *ranges]) == 0
     ((_, config, _),) = calls
-    own = load_pipeline("go2").train.vary.range
+    own = defaults_of("go2").train.vary.range
     assert config.vary.range == {**own, "payload": (-2.0, 3.0), "roughness": (0.0, 0.04)}
     assert own["payload"] == (-1.0, 2.5)
 

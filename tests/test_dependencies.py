@@ -19,10 +19,7 @@ IMPORTED_AS = {
     "pyserial": "serial", "rerun-sdk": "rerun", "scikit-learn": "sklearn",
 }  # fmt: skip
 MAY_IMPORT = {
-    "view": {
-        *("sim2real.view.rerun_recording", "sim2real.view.rerun_viewer", "sim2real.view.model_scene"),
-        "pipelines.pendulum.scene",
-    },
+    "view": {"sim2real.view.rerun_recording", "sim2real.view.rerun_viewer", "sim2real.view.model_scene"},
     "hardware": {"sim2real.policy.runner"},
     "interop": {"sim2real.interop.brax", "sim2real.interop.vector"},
     "parquet": {"sim2real.log.importing.lerobot"},

@@ -19,7 +19,7 @@ import pytest
 
 from sim2real import cli
 from sim2real.cli import COMMANDS
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -67,7 +67,7 @@ SMALLER = {
 }
 """Page -> what it computes -> what is computed here instead."""
 FILES = {
-    "docs/tutorial.md": ("pipelines/head/__init__.py", "pipelines/head/robot.py"),
+    "docs/tutorial.md": ("pipelines/head/robot.py",),
     "docs/guides/walk.md": ("pipelines/walker/__init__.py", "pipelines/walker/robot.py"),
 }
 """Pages whose first blocks are files."""
@@ -129,7 +129,7 @@ def test_the_python_of_a_page_runs(page, tmp_path, monkeypatch, request, virtual
     if page == "docs/guides/walk.md":
         shutil.copy(ROOT / "pipelines" / "go2" / "go2.xml", tmp_path / "pipelines" / "walker" / "walker.xml")
         assert cli.main(["info", "walker"]) == 0
-        assert load_pipeline("walker").load().model.needs_gpu
+        assert load_robot("walker").model.needs_gpu
     if page == "docs/tutorial.md":
         (tmp_path / "pipelines" / "head" / "head.xml").write_text((ROOT / page).read_text().split("```")[3][4:])
     names = {"__name__": "page", "folder": tmp_path}

@@ -13,7 +13,7 @@ import sim2real
 from sim2real import cli
 from sim2real.commands import flags
 from sim2real.errors import Sim2RealError
-from sim2real.stages.pipeline.pipeline import available
+from sim2real.stages.load import available
 
 ROOT = Path(sim2real.__file__).parents[1]
 COMMAND = re.compile(rf"(?P<quote>`?)sim2real (?P<name>{'|'.join(cli.COMMANDS)})\b(?P<rest>[^`;\n]*)")

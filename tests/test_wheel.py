@@ -66,9 +66,7 @@ def test_command_runs_from_the_wheel(environment, outside):
 
 @pytest.mark.night
 def test_imports_come_from_the_wheel(environment, outside):
-    code = (
-        "import sim2real, sim2real.stages.pipeline.pipeline as p; print(sim2real.__file__, p.load_pipeline('pendulum'))"
-    )
+    code = "import sim2real, sim2real.stages.load as p; print(sim2real.__file__, p.load_robot('pendulum'))"
     assert call(environment / "bin" / "python", "-c", code, **outside).startswith(str(environment))
-    code = "from sim2real.stages.pipeline.pipeline import available; print(available()['pendulum'])"
+    code = "from sim2real.stages.load import available; print(available()['pendulum'])"
     assert "site-packages/sim2real/_pipelines/pendulum" in call(environment / "bin" / "python", "-c", code, **outside)

@@ -1,12 +1,8 @@
-"""The unbalanced disk: a recorded DC motor with an eccentric mass, to be identified from its voltage and angle."""
+"""Recorded motor with an eccentric mass: identify friction, encoder and delay."""
 
-from sim2real.stages.config import IdentifyConfig
-from sim2real.stages.pipeline.pipeline import Pipeline
+from sim2real.stages.config import Defaults, IdentifyConfig
 
-PIPELINE = Pipeline(
-    name="disk",
-    summary="recorded motor with an eccentric mass: identify friction, encoder and delay",
-    package=__name__,
+DEFAULTS = Defaults(
     # Windows of a second determine the delay, longer ones the friction; a kinked loss needs its kinks averaged out.
     identify=IdentifyConfig(settle_s=0.3, horizon_s=2.0, long_s=5.0, free_run_s=130.0, population=24, generations=40),
 )

@@ -1,7 +1,6 @@
-"""A Unitree Go2 that walks: it follows a commanded velocity."""
+"""Quadruped with a floating base: follow a commanded velocity."""
 
-from sim2real.stages.config import DeployConfig, GateLimits, IdentifyConfig, RecordConfig, TrainConfig
-from sim2real.stages.pipeline.pipeline import Pipeline
+from sim2real.stages.config import Defaults, DeployConfig, GateLimits, IdentifyConfig, RecordConfig, TrainConfig
 from sim2real.training.config import PPOConfig
 from sim2real.training.environment.variation import VariationConfig
 
@@ -42,10 +41,7 @@ WALK = PPOConfig(
     evaluations=5,
 )
 
-PIPELINE = Pipeline(
-    name="go2",
-    summary="quadruped with a floating base: follow a commanded velocity",
-    package=__name__,
+DEFAULTS = Defaults(
     record=RecordConfig(duration_s=12.0, amplitude=0.3, low_hz=0.2, high_hz=4.0, gate=GATE),
     identify=IdentifyConfig(generations=0, folds=0, after_s=AFTER_S),
     train=TrainConfig(model="nominal", episode_s=10.0, timelines=256, sensitivity=False, vary=VARY, ppo=WALK),

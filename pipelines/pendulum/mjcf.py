@@ -19,6 +19,8 @@ _MJCF = """<mujoco model="pendulum">
       <joint name="{hinge}" type="hinge" axis="0 1 0" damping="{damping}" frictionloss="{friction}"
              solreffriction="{stiff_s} 1"/>
       <inertial pos="0 0 {length}" mass="{mass}" diaginertia="{inertia} {inertia} {inertia}"/>
+      <geom type="cylinder" size="0.055 0.006" euler="90 0 0" contype="0" conaffinity="0" rgba="0.6 0.6 0.7 1"/>
+      <geom type="sphere" size="0.009" pos="0 -0.006 {mass_at}" contype="0" conaffinity="0" rgba="0.8 0.3 0.2 1"/>
     </body>
   </worldbody>
   <actuator><general name="motor" joint="{hinge}" gainprm="{gain}"/></actuator>
@@ -46,6 +48,7 @@ def mjcf_of(values: Mapping[str, Scalar], step_s: float = STEP_S) -> str:
         friction=float(values["friction"]) * inertia,
         stiff_s=2 * step_s,
         length=length,
+        mass_at=float(nominal.length),
         mass=mass,
         inertia=inertia - mass * length**2,
         gain=float(values["gain"]) * inertia,

@@ -1,16 +1,12 @@
-"""The SO-101, LeRobot's arm of six Feetech servos: it reaches for targets, opening its jaw as commanded."""
+"""SO-101 arm of six Feetech servos: reach for a target, with the jaw at its commanded opening."""
 
-from sim2real.stages.config import DeployConfig, GateLimits, IdentifyConfig, RecordConfig, TrainConfig
-from sim2real.stages.pipeline.pipeline import Pipeline
+from sim2real.stages.config import Defaults, DeployConfig, GateLimits, IdentifyConfig, RecordConfig, TrainConfig
 from sim2real.training.config import PPOConfig
 
 # rad, rad/s, rad/s. Each joint's own limits are narrower; they keep the arm off the table: see robot.py.
 GATE = GateLimits(limit=1.75, slew_per_s=8.0, max_speed_rad_s=12.0)
 
-PIPELINE = Pipeline(
-    name="so101",
-    summary="SO-101 arm of six Feetech servos: reach for a target, with the jaw at its commanded opening",
-    package=__name__,
+DEFAULTS = Defaults(
     # Slower motion cannot separate a delay from the rotors' inertia: these servos' motion lags as little by either.
     record=RecordConfig(amplitude=0.4, low_hz=0.2, high_hz=6.0, gate=GATE),
     # Friction, torque limits and delays have several optima between them: a search comes before the refinement.

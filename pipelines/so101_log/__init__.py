@@ -1,12 +1,8 @@
-"""The SO-101 arm: six recorded position servos, to be identified from goals and positions."""
+"""Recorded arm of six position servos: identify loops, friction, gravity and contact."""
 
-from sim2real.stages.config import IdentifyConfig
-from sim2real.stages.pipeline.pipeline import Pipeline
+from sim2real.stages.config import Defaults, IdentifyConfig
 
-PIPELINE = Pipeline(
-    name="so101_log",
-    summary="recorded arm of six position servos: identify loops, friction, gravity and contact",
-    package=__name__,
+DEFAULTS = Defaults(
     # Forty-five parameters: a search would need thousands of generations, and rough values are available.
     identify=IdentifyConfig(
         initial_state="measured",

@@ -1,12 +1,8 @@
-"""A recorded DYNAMIXEL XL330 that lifts a mass on an arm: identify motor, gears and friction from its motions."""
+"""Recorded DYNAMIXEL XL330 lifting a mass: identify motor, gears and friction."""
 
-from sim2real.stages.config import IdentifyConfig
-from sim2real.stages.pipeline.pipeline import Pipeline
+from sim2real.stages.config import Defaults, IdentifyConfig
 
-PIPELINE = Pipeline(
-    name="xl330",
-    summary="recorded DYNAMIXEL XL330 lifting a mass: identify motor, gears and friction",
-    package=__name__,
+DEFAULTS = Defaults(
     # The loss has kinks wherever the arm sticks or breaks loose: short windows, and differences wide enough to look
     # past them. Rough values are available; a search of as many seconds ends elsewhere with every seed.
     identify=IdentifyConfig(

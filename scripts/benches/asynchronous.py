@@ -12,7 +12,7 @@ from sim2real.graph.node import BaseNode
 from sim2real.robots.nodes import SimActuator, SimSensor
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import Clock
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_module
 
 WARM_S = 0.5
 """Time on the wall clock before the measurement [s]."""
@@ -21,7 +21,7 @@ QUICK = {"seconds": 0.2, "rate": 100.0, "steps": 20}
 
 def loop(rate_hz: float) -> dict[str, BaseNode]:
     """Return the pendulum's four nodes at one rate."""
-    model = load_pipeline("pendulum").load("model")
+    model = load_module("pendulum", "model")
     delay = 0.2 / rate_hz
     world = model.PendulumWorld("world", rate_hz)
     sensor = SimSensor("sensor", rate_hz, world, delay_dist=delay)

@@ -29,7 +29,7 @@ from sim2real.errors import Sim2RealError
 from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.safety.gate import SafetyGate
 from sim2real.stages.excitation.signals import excitation
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 
 CAUSES = {"none": "", "friction": "friction", "payload": "payload", "delay": "round_trip_delay"}
 """Change of the robot -> the parameter that the verdict must name."""
@@ -84,9 +84,9 @@ class HiddenArm:
         Args:
             session: Seed of jitter and excitation.
         """
-        pipeline = load_pipeline("so101")
-        robot = pipeline.load()
-        config = replace(pipeline.record, duration_s=seconds, seed=1000 * self.number + session)
+        pipeline = load_robot("so101")
+        robot = pipeline
+        config = replace(pipeline.defaults.record, duration_s=seconds, seed=1000 * self.number + session)
         signal = robot.drive.around(excitation(config, hidden.RATE_HZ, len(robot.drive.servos.joints)))
         away = np.asarray(robot.drive.servos.at_rest) - signal[0]
         left = np.abs(away) - np.arange(len(signal))[:, None] / hidden.RATE_HZ
@@ -95,7 +95,7 @@ class HiddenArm:
 
     def probe(self, path: Path, session: int) -> None:
         """Write the log of the small steps before a deployment: away from rest and back."""
-        robot = load_pipeline("so101").load()
+        robot = load_robot("so101")
         rest, probe = np.asarray(robot.drive.servos.at_rest, float), robot.drive.probe
         away = rest + STEP_RAD * (np.arange(len(rest)) == probe.joint)
         each = round(STEP_S * hidden.RATE_HZ)
@@ -103,7 +103,7 @@ class HiddenArm:
 
     def deploy(self, path: Path, seconds: float, session: int) -> None:
         """Write the log of an episode of the policy written by hand; ``session`` is the seed of its targets."""
-        robot, rng = load_pipeline("so101").load(), np.random.default_rng([self.number, session])
+        robot, rng = load_robot("so101"), np.random.default_rng([self.number, session])
         module = sys.modules[type(robot).__module__]
         targets = rng.uniform(module.LOW, module.HIGH, (int(seconds / TARGET_S) + 1, len(module.LOW)))
         fastest = robot.drive.servos.speed
@@ -117,8 +117,8 @@ class HiddenArm:
     def _play(self, path: Path, policy: Policy, seconds: float, session: int) -> None:
         """Run the loop on a simulated clock, from rest, and write its log."""
         # Make the plant at rest, with the servos' settings, and the gate.
-        pipeline = load_pipeline("so101")
-        robot, rng = pipeline.load(), np.random.default_rng([self.number, session, 1])
+        pipeline = load_robot("so101")
+        robot, rng = pipeline, np.random.default_rng([self.number, session, 1])
         plant: Any = load_plant(robot.drive.embedded.plant, self.plant)
         sheet, rest = robot.drive.servos.sheet, robot.drive.servos.at_rest
         plant.data.qpos[:] = rest
@@ -127,7 +127,7 @@ class HiddenArm:
         zero = [plant.measure(i)[0] - angle for i, angle in zip(plant.servo_ids, rest, strict=True)]
         for servo_id in plant.servo_ids:
             clock.configure(servo_id, sheet.p_gain, 0, sheet.profile_rad_s)
-        gate = SafetyGate(robot.drive.gate(pipeline.deploy.gate))
+        gate = SafetyGate(robot.drive.gate(pipeline.defaults.deploy.gate))
         gate.reset(rest)
         goal, count, acts_ns = np.asarray(rest, float), int(seconds * hidden.RATE_HZ), 0
         starts, ends = ({n: np.zeros(count) for n in ("sensor", "agent", "actuator")} for _ in range(2))
@@ -212,11 +212,11 @@ def one_robot(number: int, options: argparse.Namespace) -> dict[str, Any]:
     import sim2real
     from sim2real.artifacts.recording import Recording
 
-    begin, robot, pipeline = time.process_time(), HiddenArm.draw(number), load_pipeline("so101")
+    begin, robot, pipeline = time.process_time(), HiddenArm.draw(number), load_robot("so101")
     with tempfile.TemporaryDirectory() as folder:
         session = Path(folder) / "session.mcap"
         robot.record(session, options.record_s, 0)
-        config = replace(pipeline.identify, seed=number, folds=options.folds, generations=options.generations)
+        config = replace(pipeline.defaults.identify, seed=number, folds=options.folds, generations=options.generations)
         identified = sim2real.identify(pipeline, [Recording.load(session)], config)
         changes = {c: one_change(robot, c, pipeline, identified, Path(folder), options) for c in options.changes}
     return {"number": number, "cpu_s": time.process_time() - begin, "truth": asdict(robot), "changes": changes}

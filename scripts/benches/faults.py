@@ -37,7 +37,7 @@ from sim2real.errors import ERROR, HARDWARE_LOST, SAFETY_STOP, Sim2RealError
 from sim2real.hardware.device import OperatingMode
 from sim2real.log.reader import TruncatedLogWarning, read_log
 from sim2real.policy import PolicyContract, save_bundle
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 
 SAFE_S = 0.2
 KILLED, STOPPED, NAN = "killed", "stopped", "nan"
@@ -110,7 +110,7 @@ class Outcome:
 
 def swinging_bundle(folder: Path) -> Path:
     """Write a policy that pumps the pendulum: full voltage in the direction of the motion."""
-    robot = load_pipeline("pendulum").load()
+    robot = load_robot("pendulum")
     size, low, high = robot.agent.observation_size, *np.array([(a.low, a.high) for a in robot.agent.action]).T
     kernel = np.zeros((size, 1))
     kernel[2] = 40.0  # thdot / 10
@@ -170,7 +170,7 @@ def _deploy(flags: list[str], messages: Path) -> None:
     sys.stdout = sys.stderr = messages.open("w", buffering=1)
     os.dup2(sys.stdout.fileno(), 1)  # the guardian's process reports there
     os.dup2(sys.stdout.fileno(), 2)
-    _nan_on_signal(load_pipeline("pendulum").load().sensor)
+    _nan_on_signal(load_robot("pendulum").sensor)
     os._exit(cli.main(["deploy", "pendulum", *flags]))
 
 
@@ -193,7 +193,7 @@ def run_once(fault: Fault, seed: int, bundle: Path, folder: Path, watchdog_s: fl
         NotBegun: The deployment did not begin to move, or a busy machine stopped it before the fault.
     """
     draw = random.Random(f"{fault.name}/{seed}")
-    robot = load_pipeline("pendulum").load()
+    robot = load_robot("pendulum")
     config = replace(robot.drive.embedded.emulator, seed=seed, model_number=1020, on_signal=True, **fault.emulator)
     truth, messages = folder / "truth.bin", folder / "messages.txt"
     with emulated(config, robot.drive.embedded.plant, truth) as (port, emulator_pid):

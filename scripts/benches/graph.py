@@ -24,11 +24,11 @@ from sim2real.graph.timeline import Timeline
 from sim2real.robots.nodes import SimActuator, SimSensor
 from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.runtime.compiled.wiring import wire
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_module
 from sim2real.types import Array, Key, PyTree
 from sim2real.worlds.joint import JointWorld
 
-MODEL = load_pipeline("pendulum").load("model")
+MODEL = load_module("pendulum", "model")
 DURATION_S, EPISODES = 4.0, 32
 CASES = {
     "plain": ((50.0, 50.0, 0.01), (1,)),

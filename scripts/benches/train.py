@@ -16,7 +16,7 @@ from sim2real.graph.delays import EmpiricalDist
 from sim2real.graph.schedule import draw
 from sim2real.robots.loop import AGENT
 from sim2real.runtime.compiled.graph import CompiledGraph
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_module, load_robot
 from sim2real.training.config import PPOConfig
 from sim2real.training.environment.graph_environment import GraphEnvironment
 from sim2real.training.ppo.trainer import TrainResult, train
@@ -48,8 +48,8 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 def environment(timelines: int, episode_s: float) -> GraphEnvironment:
     """Return the pendulum as the embedded robot is, on timelines with the jitter of a quiet machine."""
-    robot = load_pipeline("pendulum").load()
-    truth = load_pipeline("pendulum").load("plant").PendulumPlant().truth()
+    robot = load_robot("pendulum")
+    truth = load_module("pendulum", "plant").PendulumPlant().truth()
     values = {**truth, "sensor_delay": 0.02, "actuator_delay": 0.025}
     rng = np.random.default_rng(0)
     draws = {name: value * (1 + SPREAD * rng.standard_normal(DRAWS)) for name, value in truth.items()}

@@ -94,9 +94,9 @@ def one(trial: Trial, seed: int) -> tuple[bool, float, float]:
     """Walk on a hidden twin; return whether it fell, and the errors [m/s], [rad/s]."""
     from sim2real.policy.bundle import load_bundle
     from sim2real.robots.walking.twin import STEP_S, HiddenTwin, Twin, walk
-    from sim2real.stages.pipeline.pipeline import load_pipeline
+    from sim2real.stages.load import load_robot
 
-    found = load_pipeline(trial.pipeline)
+    found = load_robot(trial.pipeline)
     robot: Any = found.load()
     rng = np.random.default_rng(seed)
     hidden = HiddenTwin.draw(np.random.default_rng(1000 + seed), len(robot.joints))

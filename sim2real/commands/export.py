@@ -12,7 +12,7 @@ from sim2real.commands.stages import examples_of, summary_of
 from sim2real.errors import UsageError
 from sim2real.runtime import compilation_cache
 from sim2real.stages.flag import Flag
-from sim2real.stages.pipeline.pipeline import available, load_pipeline
+from sim2real.stages.load import available, folder_of, load_robot, shipped_policy
 
 Format = Literal["mjcf", "mjlab", "isaaclab", "json", "card", "policy"]
 FILES = {"mjcf": "identified.xml", "mjlab": "mjlab.py", "isaaclab": "isaaclab.py", "json": "identified.json",
@@ -66,8 +66,8 @@ def run(config: ExportConfig) -> Path:
     file = find_parameters(config.source, config.runs)
     identification = Identification.load(file)
     out = config.out or Path(f"{identification.pipeline}_{FILES[config.to]}")
-    pipeline = load_pipeline(identification.pipeline)
-    write_export(identification, pipeline, config.to, out, str(file), file.resolve().parent.parent)
+    robot = load_robot(identification.pipeline)
+    write_export(identification, robot, config.to, out, str(file), file.resolve().parent.parent)
     wrote(out)
     return out
 
@@ -113,7 +113,7 @@ def find_bundle(source: str, runs: Path) -> Path:
         try:
             return warn_of_stale(newest(runs, source, "train")).output("bundle")
         except Sim2RealError:
-            if (shipped := load_pipeline(source).shipped).is_dir():
+            if (shipped := shipped_policy(folder_of(source))) is not None:
                 return shipped
             raise
     run_dir = find_run(runs, source)

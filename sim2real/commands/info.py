@@ -8,15 +8,15 @@ from typing import Annotated, Any
 
 from sim2real.artifacts.files import plain
 from sim2real.artifacts.run import STAGES, attempts, run_folders, stage_status, versions
-from sim2real.commands import flags
-from sim2real.commands.stages import DEMO_PIPELINE, examples_of, summary_of
+from sim2real.commands import flags, stages
+from sim2real.commands.stages import DEMO_PIPELINE, examples_of
 from sim2real.errors import Sim2RealError
 from sim2real.hardware import entries
 from sim2real.installation import has_jax
 from sim2real.runtime import compilation_cache
 from sim2real.stages.flag import Flag
+from sim2real.stages.load import available, defaults_of, folder_of, load_robot, summary_of
 from sim2real.stages.pipeline.find_run import find_run
-from sim2real.stages.pipeline.pipeline import Pipeline, available, load_pipeline
 from sim2real.stages.terminal.console import pairs, shown, table
 
 
@@ -36,7 +36,7 @@ def info(command: str, arguments: list[str]) -> None:
     """``sim2real info [PIPELINE|LOG|RUN]``."""
     default = InfoConfig()
     examples = examples_of("info", f"info {DEMO_PIPELINE}", f"info runs/{DEMO_PIPELINE}/TIME")
-    config = flags.parse(default, arguments, f"sim2real {command}", summary_of(default), examples)
+    config = flags.parse(default, arguments, f"sim2real {command}", stages.summary_of(default), examples)
     if config.target is None:
         print(installation())
     elif Path(config.target).is_file():
@@ -52,7 +52,7 @@ def installation() -> str:
     rows = []
     for name, source in sorted(available().items()):
         try:
-            summary = load_pipeline(name).summary
+            summary = summary_of(name)
         except Exception as error:  # one broken pipeline must not hide the others
             summary = f"cannot be imported: {type(error).__name__}: {error}"
         rows.append([name, summary, _origin(source)])
@@ -78,34 +78,32 @@ def _programs() -> str:
 def pipeline(name: str, root: Path, verbose: bool) -> str:
     """Return a pipeline's files, runs and next command, in ten lines; ``verbose`` adds the default of each flag."""
     # Names, folder and the state of the newest run.
-    definition = load_pipeline(name)
     runs = run_folders(root, name)
     head = {
-        "pipeline": definition.name,
-        "summary": definition.summary,
-        "folder": shown(definition.folder),
+        "pipeline": name,
+        "summary": summary_of(name),
+        "folder": shown(folder_of(name)),
         "runs": f"{len(runs)} in {shown(root)}",
     }
     if runs:
         stages = {stage: "out of date" if s.stale else "finished" for stage, s in stage_status(runs[-1]).items()}
         states = [f"{stage} {stages.get(stage, 'not finished')}" for stage in STAGES]
         head |= {"newest run": runs[-1].name, "its stages": ", ".join(states)}
-    head["commands"] = _commands(definition)
+    head["commands"] = _commands(name)
     if not verbose:
         return pairs(head | {"defaults of flags": f"sim2real info {name} --verbose"})
     # The default of each flag, one table for each stage.
     blocks = [pairs(head)]
     for stage in STAGES:
-        config = getattr(definition, stage)
+        config = getattr(defaults_of(name), stage)
         blocks.append(table(flags.flags_of(config), [stage, "default"]))
     return "\n\n".join(blocks)
 
 
-def _commands(definition: Pipeline) -> str:
+def _commands(name: str) -> str:
     """Return the commands that work for a pipeline: a recorded robot has no hardware, task and policy."""
-    name = definition.name
     try:
-        robot = definition.load()
+        robot = load_robot(name)
     except Sim2RealError as error:  # such as a package that is not installed
         return f"none: {error.args[0]}"
     from sim2real.robots.robot import Robot  # imports JAX

@@ -21,11 +21,12 @@ from sim2real.artifacts.run import STAGES, StageFolder, finished, stage_status
 from sim2real.artifacts.summary import Shown
 from sim2real.commands.run import RunFlags
 from sim2real.errors import DelayChanged, Sim2RealError, UsageError
+from sim2real.robots.robot import RecordedRobot, Robot
 from sim2real.stages.config import DeployConfig, IdentifyConfig, RecordConfig, TrainConfig
 from sim2real.stages.deploy.next_command import logs_to_identify, needs_timing, terms_to_identify
+from sim2real.stages.load import AnyRobot, defaults_of, robot_of, shipped_policy
 from sim2real.stages.pipeline.find_run import find_run
-from sim2real.stages.pipeline.pipeline import Pipeline, pipeline_of
-from sim2real.stages.pipeline.python_arguments import AnyPath, AnyRobot, config_of, folder_of
+from sim2real.stages.pipeline.python_arguments import AnyPath, config_of, folder_of
 from sim2real.stages.terminal.console import artifact_table, note
 
 CallStage = Callable[[str, Any, Path | None], StageFolder]
@@ -37,7 +38,7 @@ _MAX_RETRIES = 2
 _LONGEST_DELAY_S = 1.0
 
 
-def run_all(pipeline: Pipeline, flags: RunFlags, call: CallStage) -> Path | None:
+def run_all(robot: RecordedRobot, flags: RunFlags, call: CallStage) -> Path | None:
     """Run the four stages in one run folder, from the first stage without a current result; then the iterations.
 
     Returns:
@@ -47,14 +48,14 @@ def run_all(pipeline: Pipeline, flags: RunFlags, call: CallStage) -> Path | None
     if flags.record.dry_run:
         raise UsageError(
             "a dry recording holds no motion: a run cannot identify from it",
-            hint=f"`sim2real record {pipeline.name} --dry-run` records alone; of a run, only deploy can be dry",
+            hint=f"`sim2real record {robot.name} --dry-run` records alone; of a run, only deploy can be dry",
         )
-    run_dir = find_run(flags.runs, flags.resume, pipeline.name) if flags.resume else None
-    shipped = why_shipped(pipeline)
+    run_dir = find_run(flags.runs, flags.resume, robot.name) if flags.resume else None
+    shipped = why_shipped(robot)
     if flags.iterations > 1 and shipped:
         raise UsageError(f"{shipped}, and iterations train another one", hint="run without --iterations")
     if flags.iterations > 1:
-        return _Iterating(pipeline, flags, call).run(run_dir)
+        return _Iterating(robot, flags, call).run(run_dir)
     # Skip the stages with a current result. After a stage that runs, the results of all later stages are out of date.
     rerun = False
     for number, stage in enumerate(STAGES, 1):
@@ -72,19 +73,16 @@ def run_all(pipeline: Pipeline, flags: RunFlags, call: CallStage) -> Path | None
     return run_dir
 
 
-def why_shipped(pipeline: Pipeline) -> str:
+def why_shipped(robot: RecordedRobot) -> str:
     """Return why a run deploys the policy that its pipeline ships; "" if it trains one."""
-    if not pipeline.shipped.is_dir():
+    if shipped_policy(robot.folder) is None:
         return ""
     import jax
 
-    from sim2real.robots.robot import Robot
-
-    robot = pipeline.load()
     if not isinstance(robot, Robot) or not robot.model.needs_gpu or jax.default_backend() == "gpu":
         return ""
     return (
-        f"a policy for {pipeline.name} takes hours to train without a GPU, and JAX has none here: the run deploys the "
+        f"a policy for {robot.name} takes hours to train without a GPU, and JAX has none here: the run deploys the "
         "policy that the pipeline ships"
     )
 
@@ -111,7 +109,7 @@ class Plan:
 class _Iterating:
     """The iterations of a run. Each plan follows from the run folder alone, so that an interrupted run goes on."""
 
-    pipeline: Pipeline
+    robot: RecordedRobot
     flags: RunFlags
     call: CallStage
 
@@ -196,7 +194,7 @@ class _Iterating:
         logs = logs_to_identify(deployed, deployment.drift, identification, folder.folder)
         if not logs:
             return self._anew(run_dir, STAGES, deployment.drift)
-        terms = terms_to_identify(self.flags.identify.terms, self.pipeline, identification, deployment.drift)
+        terms = terms_to_identify(self.flags.identify.terms, self.robot, identification, deployment.drift)
         words = f"identify from {len(logs)} log{'s' * (len(logs) > 1)}, the deployment's among them, train, deploy"
         return Plan(("identify", "train", "deploy"), words, logs, terms, seed)
 
@@ -206,7 +204,7 @@ class _Iterating:
         if finished(run_dir, "identify") is None:
             return Plan(stages, words)
         known = self._newest_identification(run_dir)
-        terms = terms_to_identify(self.flags.identify.terms, self.pipeline, known, drift)
+        terms = terms_to_identify(self.flags.identify.terms, self.robot, known, drift)
         return Plan(stages, words, terms=terms, seed=self._next_seed(run_dir))
 
     def _config(self, plan: Plan, stage: str) -> Any:
@@ -254,7 +252,7 @@ class _Iterating:
     def _newest_identification(self, run_dir: Path) -> Identification:
         folder = finished(run_dir, "identify")
         if folder is None:
-            raise Sim2RealError("this run has no identification", hint=f"sim2real identify {self.pipeline.name}")
+            raise Sim2RealError("this run has no identification", hint=f"sim2real identify {self.robot.name}")
         return Identification.load(folder.output("parameters"))
 
     def _next_seed(self, run_dir: Path) -> int:
@@ -382,8 +380,8 @@ def run(
     """Record, identify, train and deploy, one after the other, in one run folder.
 
     Args:
-        robot: The robot, its pipeline, or the pipeline's name.
-        record: Settings of record; default: the pipeline's. A dict has the settings that differ from these.
+        robot: The robot, or the name of its pipeline.
+        record: Settings of record; default: the robot's. A dict has the settings that differ from these.
         resume: A run folder to go on with, from the first stage that is not finished there.
         iterations: Most iterations; see ``sim2real run --help``.
         until: ``QUANTITY=VALUE`` that ends the iterations.
@@ -392,18 +390,18 @@ def run(
         The run, with the results of its stages.
     """
     # Turn names and dicts into objects; each stage then runs as from the command line.
-    pipeline, root = pipeline_of(robot), folder_of(runs, "runs")
+    robot, root = robot_of(robot), folder_of(runs, "runs")
     settings = {"record": record, "identify": identify, "train": train, "deploy": deploy}
-    configs: dict[str, Any] = {n: config_of(settings[n], c, n) for n, c in pipeline.in_a_run.items()}
-    home = None if resume is None else find_run(root, folder_of(resume, "resume"), pipeline.name)
+    configs: dict[str, Any] = {n: config_of(settings[n], c, n) for n, c in defaults_of(robot).in_a_run.items()}
+    home = None if resume is None else find_run(root, folder_of(resume, "resume"), robot.name)
 
     def call(stage: str, config: Any, run_dir: Path | None) -> StageFolder:
         nonlocal home
-        done = importlib.import_module(f"sim2real.stages.{stage}.stage").run(pipeline, config, root, run_dir)
+        done = importlib.import_module(f"sim2real.stages.{stage}.stage").run(robot, config, root, run_dir)
         home = done.run_dir
         return done
 
-    run_all(pipeline, RunFlags(runs=root, resume=home, iterations=iterations, until=until, **configs), call)
+    run_all(robot, RunFlags(runs=root, resume=home, iterations=iterations, until=until, **configs), call)
     if home is None:
         raise UsageError("no stage ran")
     return Run(home)

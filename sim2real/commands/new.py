@@ -15,7 +15,7 @@ from sim2real.commands.stages import examples_of, run_stage, summary_of
 from sim2real.errors import ERROR, UsageError
 from sim2real.runtime import compilation_cache
 from sim2real.stages.flag import Flag
-from sim2real.stages.pipeline.pipeline import Pipeline, available, load_pipeline
+from sim2real.stages.load import available, defaults_of, load_module, load_robot
 from sim2real.stages.pipeline.robot_flags import RobotFlags
 
 if TYPE_CHECKING:
@@ -33,13 +33,9 @@ _INIT = '''"""{summary}."""
 
 from dataclasses import replace
 
-from sim2real.stages.config import MODEL_IDENTIFY
-from sim2real.stages.pipeline.pipeline import Pipeline
+from sim2real.stages.config import MODEL_IDENTIFY, Defaults
 
-PIPELINE = Pipeline(
-    name="{name}",
-    summary="{summary}",
-    package=__name__,
+DEFAULTS = Defaults(
     # Every field of sim2real.stages.config.IdentifyConfig may stand here: how long segments are, which delays may be.
     identify=replace(MODEL_IDENTIFY, horizon_s={horizon_s:g}, max_delay_s={max_delay_s:g}),
 )
@@ -58,14 +54,11 @@ _LIKE_INIT = '''"""A robot like {like}, with its own calibration."""
 
 from dataclasses import replace
 
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import defaults_of
 
-LIKE = load_pipeline("{like}")
-PIPELINE = replace(
+LIKE = defaults_of("{like}")
+DEFAULTS = replace(
     LIKE,
-    name="{name}",
-    summary="a {like} of its own calibration",
-    package=__name__,
     record=replace(LIKE.record, port={port!r}),
     deploy=replace(LIKE.deploy, port={port!r}),
 )
@@ -74,9 +67,9 @@ _LIKE_ROBOT = '''"""The robot, with the calibration beside this file."""
 
 from pathlib import Path
 
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_module
 
-ROBOT = load_pipeline("{like}").load("guide").robot(Path(__file__).with_name("calibration.json"))
+ROBOT = load_module("{like}", "guide").robot(Path(__file__).with_name("calibration.json"))
 '''
 
 
@@ -202,7 +195,7 @@ def _run_like(config: NewConfig) -> bool:
     from sim2real.stages.terminal.console import wrote
 
     like, port, folder = _checked(config)
-    guide = like.load("guide")
+    guide = load_module(like, "guide")
     with tempfile.TemporaryDirectory() as temporary:
         # Find faults of the arm before a motor moves.
         calibration = Path(temporary) / _CALIBRATION
@@ -211,14 +204,14 @@ def _run_like(config: NewConfig) -> bool:
         shutil.copy(calibration, folder / _CALIBRATION)
     wrote(folder / _CALIBRATION)
     for name, text in (("__init__.py", _LIKE_INIT), ("robot.py", _LIKE_ROBOT)):
-        (folder / name).write_text(text.format(name=config.name, like=like.name, port=port), encoding="utf-8")
+        (folder / name).write_text(text.format(name=config.name, like=like, port=port), encoding="utf-8")
         wrote(folder / name)
     # The only question: from here on the arm moves.
-    pipeline = load_pipeline(config.name)
-    _ask(f"The arm moves next, for {pipeline.record.duration_s:g} s: let go of it, clear its table, and press Enter. ")
-    recorded = run_stage("record", pipeline, pipeline.record, config.runs, None, page=False)
+    robot, defaults = load_robot(config.name), defaults_of(config.name)
+    _ask(f"The arm moves next, for {defaults.record.duration_s:g} s: let go of it, clear its table, and press Enter. ")
+    recorded = run_stage("record", robot, defaults.record, config.runs, None, page=False)
     run_dir = None if recorded is None else recorded.run_dir
-    identified = run_stage("identify", pipeline, pipeline.identify, config.runs, run_dir)
+    identified = run_stage("identify", robot, defaults.identify, config.runs, run_dir)
     if identified is None:
         raise UsageError("identify has written no folder")
     # Open the page if there is a screen.
@@ -265,8 +258,8 @@ def calibrate(port: str, guide: Any, path: Path) -> None:
     note("the calibration fits the arm", urgent=True)
 
 
-def _checked(config: NewConfig) -> tuple[Pipeline, str, Path]:
-    """Return the pipeline of the like robot, the port and the new folder; refuse flags that do not fit."""
+def _checked(config: NewConfig) -> tuple[str, str, Path]:
+    """Return the name of the like robot, the port and the new folder; refuse flags that do not fit."""
     sources = available()
     able = sorted(n for n, s in sources.items() if isinstance(s, Path) and (s / "guide.py").is_file())
     if config.like not in able:
@@ -280,7 +273,7 @@ def _checked(config: NewConfig) -> tuple[Pipeline, str, Path]:
             f"the pipeline {config.name!r} exists already, or --folder is not ./pipelines",
             hint="choose another name, or delete it",
         )
-    return load_pipeline(config.like), config.port, config.folder / config.name
+    return config.like, config.port, config.folder / config.name
 
 
 def _ask(question: str) -> None:

@@ -11,7 +11,7 @@ from sim2real.commands.export import find_bundle
 from sim2real.commands.stages import examples_of, summary_of
 from sim2real.errors import UsageError
 from sim2real.stages.flag import Flag
-from sim2real.stages.pipeline.pipeline import available, load_pipeline
+from sim2real.stages.load import available, load_robot
 
 if TYPE_CHECKING:
     import numpy as np
@@ -85,7 +85,7 @@ def run(config: PlayConfig) -> "Walked":
     names = (config.source, *(p.name for p in folder.resolve().parents))
     if (name := next((n for n in names if n in pipelines), None)) is None:
         raise UsageError(f"{folder} lies in no folder of a pipeline", hint="sim2real play go2")
-    robot: Any = load_pipeline(name).load()
+    robot: Any = load_robot(name)
     if not isinstance(robot, ComposedRobot):
         raise UsageError(f"pipeline {name!r} does not walk", hint="sim2real play go2")
     # Walk on its twin.

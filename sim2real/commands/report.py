@@ -12,8 +12,8 @@ from sim2real.commands.stages import examples_of
 from sim2real.errors import UsageError
 from sim2real.stages.flag import Flag
 from sim2real.stages.live.config import WINDOW, is_viewer
+from sim2real.stages.load import available
 from sim2real.stages.pipeline.find_run import find_run
-from sim2real.stages.pipeline.pipeline import available
 
 if TYPE_CHECKING:
     from sim2real.artifacts.comparison import Comparison
@@ -104,14 +104,14 @@ def _show(run_dir: Path, target: str, follow: bool) -> None:
     """Show a run in the viewer, or write a file for it."""
     from sim2real.artifacts.run import pipeline_of
     from sim2real.stages.live import scene as scenes
-    from sim2real.stages.pipeline.pipeline import load_pipeline
+    from sim2real.stages.load import load_robot
     from sim2real.stages.terminal.console import wrote
     from sim2real.view.rerun_recording import view
 
-    pipeline = load_pipeline(pipeline_of(run_dir))
-    scene = scenes.drawn(scenes.scene_of(pipeline, None if pipeline.scene else pipeline.load()))
+    robot = load_robot(pipeline_of(run_dir))
+    scene = scenes.drawn(scenes.scene_of(robot))
     if follow:
-        scenes.follow(run_dir, pipeline.name, target, scene)
+        scenes.follow(run_dir, robot.name, target, scene)
         return
     save = Path(target) if target.endswith(".rrd") and "://" not in target else None
     view(run_dir, save, scene, scenes.serve if target != WINDOW and save is None else None)

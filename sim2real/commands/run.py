@@ -13,7 +13,7 @@ from sim2real.errors import UsageError
 from sim2real.runtime import compilation_cache
 from sim2real.stages.config import DeployConfig, IdentifyConfig, RecordConfig, TrainConfig
 from sim2real.stages.flag import Flag
-from sim2real.stages.pipeline.pipeline import Pipeline, load_pipeline
+from sim2real.stages.load import defaults_of, load_robot
 
 if TYPE_CHECKING:
     from sim2real.artifacts.run import StageFolder
@@ -95,8 +95,8 @@ class RunFlags(DemoFlags):
 
 def run_command(command: str, arguments: list[str]) -> None:
     """``sim2real run PIPELINE [FLAGS]``."""
-    pipeline, rest = split_pipeline(command, arguments)
-    default, name = RunFlags(**pipeline.in_a_run), pipeline.name
+    name, rest = split_pipeline(command, arguments)
+    default = RunFlags(**defaults_of(name).in_a_run)
     examples = examples_of(
         f"run {name} --seed 3 --record.duration-s 20",
         f"run {name} --resume runs/{name}/TIME",
@@ -105,7 +105,7 @@ def run_command(command: str, arguments: list[str]) -> None:
     texts = (f"sim2real run {name}", "Record, identify, train and deploy, one after the other.", examples)
     parsed = flags.parse(default, rest, *texts)
     # The seed is the default of every stage: the seed flag of a stage overrides it.
-    _run(pipeline, flags.parse(default.with_seed(parsed.seed), rest, *texts))
+    _run(name, flags.parse(default.with_seed(parsed.seed), rest, *texts))
 
 
 def demo(command: str, arguments: list[str]) -> None:
@@ -113,29 +113,31 @@ def demo(command: str, arguments: list[str]) -> None:
     text = f"Record, identify, train and deploy the embedded {DEMO_PIPELINE}, with its defaults."
     examples = examples_of("demo --seed 1", f"run {DEMO_PIPELINE} --help")
     parsed = flags.parse(DemoFlags(), arguments, f"sim2real {command}", text, examples)
-    pipeline = load_pipeline(DEMO_PIPELINE)
-    _run(pipeline, RunFlags(**{**vars(parsed), **pipeline.in_a_run}).with_seed(parsed.seed))
+    configs = defaults_of(DEMO_PIPELINE).in_a_run
+    _run(DEMO_PIPELINE, RunFlags(**{**vars(parsed), **configs}).with_seed(parsed.seed))
 
 
-def _run(pipeline: Pipeline, parsed: RunFlags) -> None:
+def _run(name: str, parsed: RunFlags) -> None:
     """Run the stages, print the main figures of each, and end with the verdict and the page."""
     compilation_cache.enable(parsed.cache)
     from sim2real.commands.loop import run_all
     from sim2real.stages.terminal import brief, console
 
+    robot = load_robot(name)
+
     def call(stage: str, config: Any, run_dir: Path | None) -> StageFolder:
         if parsed.verbose:
-            done = run_stage(stage, pipeline, config, parsed.runs, run_dir, page=stage == "identify")
+            done = run_stage(stage, robot, config, parsed.runs, run_dir, page=stage == "identify")
         else:
             with brief.brief():
-                done = run_stage(stage, pipeline, config, parsed.runs, run_dir, page=stage == "identify")
+                done = run_stage(stage, robot, config, parsed.runs, run_dir, page=stage == "identify")
         if done is None:
             raise UsageError(f"{stage} runs in several processes, and this one writes no folder")
         if not parsed.verbose and (figures := main_figures(done)):
             print("\n".join(f"  {line}" for line in console.pairs(figures).splitlines()), flush=True)
         return done
 
-    if (run_dir := run_all(pipeline, parsed, call)) is not None:
+    if (run_dir := run_all(robot, parsed, call)) is not None:
         conclude(run_dir)
 
 

@@ -14,10 +14,11 @@ from sim2real.errors import ERROR, EXIT_CODES, UsageError
 from sim2real.installation import has_jax
 from sim2real.runtime import compilation_cache
 from sim2real.stages.flag import Flag
-from sim2real.stages.pipeline.pipeline import Pipeline, available, load_pipeline
+from sim2real.stages.load import available, defaults_of, load_robot
 
 if TYPE_CHECKING:
     from sim2real.artifacts.run import StageFolder
+    from sim2real.robots.robot import RecordedRobot
 
 DEMO_PIPELINE = "pendulum"
 Config = TypeVar("Config")
@@ -38,8 +39,8 @@ class StageFlags(Generic[Config]):
 
 def stage(command: str, arguments: list[str]) -> None:
     """``sim2real record|identify|train|deploy PIPELINE [FLAGS]``."""
-    pipeline, rest = split_pipeline(command, arguments)
-    default, name = getattr(pipeline, command), pipeline.name
+    name, rest = split_pipeline(command, arguments)
+    default = getattr(defaults_of(name), command)
     examples = examples_of(f"{command} {name} --runs /data/runs", f"report {name}")
     parsed = flags.parse(StageFlags(default), rest, f"sim2real {command} {name}", summary_of(default), examples)
     compilation_cache.enable(parsed.cache)
@@ -48,20 +49,20 @@ def stage(command: str, arguments: list[str]) -> None:
         from sim2real.stages.pipeline.find_run import find_run
 
         run_dir = find_run(parsed.runs, parsed.run, name)
-    run_stage(command, pipeline, parsed.config, parsed.runs, run_dir, page=command in ("identify", "deploy"))
+    run_stage(command, load_robot(name), parsed.config, parsed.runs, run_dir, page=command in ("identify", "deploy"))
 
 
 def check(command: str, arguments: list[str]) -> None:
     """``sim2real check PIPELINE [FLAGS]``."""
     from sim2real.stages.check.config import CheckConfig
 
-    pipeline, rest = split_pipeline(command, arguments)
-    default, name = CheckConfig(record=pipeline.record), pipeline.name
+    name, rest = split_pipeline(command, arguments)
+    default = CheckConfig(record=defaults_of(name).record)
     description = f"{summary_of(default)} Ends with code 1 if a parameter is not determined."
     examples = examples_of(f"check {name} --log session.mcap", f"check {name} --plan --record.duration-s 60")
     config = flags.parse(default, rest, f"sim2real check {name}", description, examples)
     compilation_cache.enable()
-    _end(_imported("check").run(pipeline, config))
+    _end(_imported("check").run(load_robot(name), config))
 
 
 def validate(command: str, arguments: list[str]) -> None:
@@ -90,7 +91,7 @@ def import_files(command: str, arguments: list[str]) -> None:
 
 
 def run_stage(
-    name: str, pipeline: Pipeline, config: Any, runs: Path, run_dir: Path | None, page: bool = True
+    name: str, robot: RecordedRobot, config: Any, runs: Path, run_dir: Path | None, page: bool = True
 ) -> StageFolder | None:
     """Run a stage, then print its summary and the names of its files, and write the run's page.
 
@@ -102,7 +103,7 @@ def run_stage(
     """
     from sim2real.stages.terminal import console
 
-    folder: StageFolder | None = _imported(name).run(pipeline, config, runs, run_dir)
+    folder: StageFolder | None = _imported(name).run(robot, config, runs, run_dir)
     if folder is None:
         return None
     if folder.manifest.summary:
@@ -129,19 +130,19 @@ def write_report(run_dir: Path) -> Path | None:
     return page
 
 
-def split_pipeline(command: str, arguments: list[str]) -> tuple[Pipeline, list[str]]:
-    """Return the pipeline, which the first argument names, and the other arguments.
+def split_pipeline(command: str, arguments: list[str]) -> tuple[str, list[str]]:
+    """Return the name of the pipeline, which is the first argument, and the other arguments.
 
     ``--help`` without a pipeline shows the flags of the demo's pipeline.
     """
     if arguments and arguments[0] in ("-h", "--help", "--help-all"):
-        return load_pipeline(DEMO_PIPELINE), arguments
+        return DEMO_PIPELINE, arguments
     if not arguments or arguments[0].startswith("-"):
         raise UsageError(
             f"{command} needs a pipeline before its flags. Available: {', '.join(sorted(available())) or 'none'}",
             hint=f"sim2real {command} PIPELINE [FLAGS]; `sim2real new` makes a pipeline of a model",
         )
-    return load_pipeline(arguments[0]), arguments[1:]
+    return arguments[0], arguments[1:]
 
 
 def summary_of(config: object) -> str:

@@ -13,7 +13,7 @@
     LENGTH_S, SETTLE_S, HORIZON_S = 1.3, 0.3, 1.0
 
     # Open the robot and the log, and make the graph whose parameters are identified.
-    robot = sim2real.load_pipeline("pendulum").load()  # 1
+    robot = sim2real.load_robot("pendulum")  # 1
     episode = sim2real.Recording.load("datasets/pendulum/chirp.mcap").episode  # 2
     config = FitConfig()
     model = robot.identifiable(config.max_delay_s)  # 3

@@ -18,11 +18,10 @@ if TYPE_CHECKING:
     from sim2real.interop.environments import RobotEnvironment
     from sim2real.interop.vector import RobotVectorEnv
     from sim2real.robots.robot import Robot
-    from sim2real.stages.pipeline.pipeline import Pipeline
     from sim2real.stages.train.config import TrainConfig
 
-    Source = str | Path | Pipeline | Robot
-    """A run folder, or a pipeline, its name or its robot; of these the newest identification is taken."""
+    Source = str | Path | Robot
+    """A run folder, or a robot or the name of its pipeline; of these the newest identification is taken."""
 
 Model = Literal["identified", "nominal"]
 
@@ -49,7 +48,7 @@ def robot_environment(
         model: The estimates of identify with their uncertainty and timing, or the data sheet's values.
         values: Parameters with other values than the model's. The nominal model has delays where both are among them:
             ``sensor_delay`` and ``actuator_delay`` [s].
-        config: World, number and length of timelines, randomisation and seed; default: the pipeline's.
+        config: World, number and length of timelines, randomisation and seed; default: the robot's.
 
     Raises:
         UsageError: When there is no such pipeline, run or parameter.
@@ -58,24 +57,26 @@ def robot_environment(
     from sim2real.artifacts.run import STAGES, attempts
     from sim2real.interop.environments import RobotEnvironment
     from sim2real.robots.robot import Robot
+    from sim2real.stages.load import available, defaults_of, load_robot, moving
     from sim2real.stages.pipeline.find_run import find_run
     from sim2real.stages.pipeline.open_parameters import open_identification
-    from sim2real.stages.pipeline.pipeline import Pipeline, available, load_pipeline, pipeline_of
     from sim2real.stages.train.inputs import find_parameters
     from sim2real.stages.train.trained_bundle import contract_of
     from sim2real.stages.train.training_setup import prepare
 
-    if isinstance(source, Robot | Pipeline):
-        pipeline, run = pipeline_of(source), None
+    run = None
+    if isinstance(source, Robot):
+        robot = source
     elif str(source) in available():
-        pipeline, run = load_pipeline(str(source)), None
+        robot = moving(load_robot(str(source)))
     else:
         run = find_run(Path(runs), source)
-        pipeline = load_pipeline(next(a.manifest.pipeline for s in STAGES for a in attempts(run, s)))
-    config = replace(config or pipeline.train, model=model)
-    path, _ = find_parameters(pipeline, config, Path(runs), run)
-    identification = None if path is None else open_identification(path, pipeline)
-    setup = prepare(pipeline, config, identification, changed=values)
+        name = next(a.manifest.pipeline for s in STAGES for a in attempts(run, s))
+        robot = moving(load_robot(name))
+    config = replace(config or defaults_of(robot).train, model=model)
+    path, _ = find_parameters(robot, config, Path(runs), run)
+    identification = None if path is None else open_identification(path, robot)
+    setup = prepare(robot, config, identification, changed=values)
     return RobotEnvironment(setup.env, contract_of(setup.robot, setup.env.task, setup.values))
 
 

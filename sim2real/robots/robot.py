@@ -55,6 +55,8 @@ if TYPE_CHECKING:
     from sim2real.hardware.safety.following import Following
     from sim2real.hardware.safety.limits import GateLimits
     from sim2real.hardware.safety.rig import GateConfig
+    from sim2real.log.importing.mapping import ImportMapping
+    from sim2real.stages.config import Defaults
 
 AnyRobot = TypeVar("AnyRobot", bound="RecordedRobot")
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
@@ -304,6 +306,10 @@ class RecordedRobot(ABC):
     """A robot that was recorded: what identification needs.
 
     Attributes:
+        name: Name of its pipeline, which ``load_robot`` sets; of a robot without a folder the name of its class.
+        folder: Folder of its pipeline; None: it has none, and no command finds it by its name.
+        defaults: Default settings of its stages; None: those of ``sim2real.stages.config.Defaults``.
+        mapping: Mapping of its logs of other recorders, if it has no folder; a folder has an ``import.toml``.
         units: Field of a message -> its unit.
         profile_rad_s: Speed of the actuators' setpoints towards their goals [rad/s]; infinite: at once.
         causes: Causes that change several parameters at once: name -> parameter -> change of the parameter on its scale
@@ -311,10 +317,22 @@ class RecordedRobot(ABC):
         export_lead_s: Time that a simulation of ``identified_mjcf`` in C MuJoCo adds to the delay of commands [s].
     """
 
+    name: str = ""
+    folder: Path | None = None
+    defaults: Defaults | None = None
+    mapping: ImportMapping | None = None
     units: Mapping[str, str]
     profile_rad_s: float = math.inf
     causes: Mapping[str, Mapping[str, float]] = _NOTHING
     export_lead_s: float = 0.0
+
+    def __init_subclass__(cls) -> None:
+        cls.name = cls.__name__
+
+    def called_like(self, other: RecordedRobot) -> Self:
+        """Give this robot the name, the folder and the defaults of another one, and return it."""
+        self.name, self.folder, self.defaults, self.mapping = other.name, other.folder, other.defaults, other.mapping
+        return self
 
     @abstractmethod
     def identifiable(self, max_delay_s: float) -> IdentifiableModel:

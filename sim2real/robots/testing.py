@@ -1,7 +1,7 @@
 """For tests of robots: ``check_robot`` checks that a robot keeps the contract in ``sim2real.robots.robot``.
 
     def test_it_is_a_robot(tmp_path):
-        check_robot(load_pipeline("mine").load(), tmp_path)
+        check_robot(load_robot("mine"), tmp_path)
 
 Each function raises an ``AssertionError`` that names the defect. Torque comes on for a moment, and only on the
 embedded robot.

@@ -1,5 +1,8 @@
 """Configurations of the four stages, as pipelines import them. Imports no JAX, so that ``--help`` stays instant."""
 
+from dataclasses import dataclass, replace
+from typing import Any
+
 from sim2real.hardware.safety.limits import GateLimits as GateLimits
 from sim2real.stages.deploy.config import DeployConfig as DeployConfig
 from sim2real.stages.identify.config import IdentifyConfig as IdentifyConfig
@@ -15,3 +18,19 @@ MODEL_IDENTIFY = IdentifyConfig(
     long_s=None,
 )
 """Defaults of identify for a model, which has rough values: no search, initial states from the measurements."""
+
+
+@dataclass(frozen=True)
+class Defaults:
+    """Default settings of a robot's stages: ``DEFAULTS`` in ``pipelines/NAME/__init__.py``; fields become flags."""
+
+    record: RecordConfig = RecordConfig()
+    identify: IdentifyConfig = IdentifyConfig()
+    train: TrainConfig = TrainConfig()
+    deploy: DeployConfig = DeployConfig()
+
+    @property
+    def in_a_run(self) -> dict[str, Any]:
+        """Defaults of the stages of a run, in which a policy is trained on the run's identification."""
+        train = replace(self.train, model="identified")
+        return {"record": self.record, "identify": self.identify, "train": train, "deploy": self.deploy}

@@ -23,7 +23,7 @@ from sim2real.installation import version
 from sim2real.log.reader import read_log
 from sim2real.robots.loop import SENSOR
 from sim2real.robots.robot import RecordedRobot
-from sim2real.stages.pipeline.pipeline import Pipeline, pipeline_of
+from sim2real.stages.load import AnyRobot, robot_of
 from sim2real.stages.pipeline.python_arguments import AnyIdentification, AnyPath, identification_of
 from sim2real.stages.shared.identification import identified_robot
 from sim2real.stages.terminal.console import note
@@ -37,7 +37,7 @@ _SESSION: tuple[str, ...] = ("firmware", "voltage", "temperature")
 
 
 def export(
-    robot: RecordedRobot | Pipeline | str,
+    robot: AnyRobot,
     identification: AnyIdentification,
     out: AnyPath,
     to: Literal["mjcf", "mjlab", "isaaclab", "json", "card"] = "mjcf",
@@ -45,26 +45,26 @@ def export(
     """Write the estimates as a model of another simulator.
 
     Args:
-        robot: The robot, its pipeline, or the pipeline's name.
+        robot: The robot, or the name of its pipeline.
         identification: The identification, or its folder.
         to: ``mjcf``, ``mjlab``, ``isaaclab``, ``json``, or ``card``, which is a folder.
 
     Raises:
         UsageError: The identification was interrupted or is of another robot, or the target cannot hold the model.
     """
-    pipeline, document, out = pipeline_of(robot), identification_of(identification), Path(out)
+    robot, document, out = robot_of(robot), identification_of(identification), Path(out)
     if to not in FORMATS:
         raise UsageError(f"cannot export to {to!r}. Available: {', '.join(FORMATS)}")
-    if document.pipeline != pipeline.name:
-        raise UsageError(f"these are parameters of pipeline {document.pipeline!r}, not of {pipeline.name!r}")
+    if document.pipeline != robot.name:
+        raise UsageError(f"these are parameters of pipeline {document.pipeline!r}, not of {robot.name!r}")
     in_memory = isinstance(identification, Identification)
     where, run_dir = ("memory", None) if in_memory else (str(identification), Path(identification).resolve().parent)
-    write_export(document, pipeline, to, out, where, run_dir)
+    write_export(document, robot, to, out, where, run_dir)
     return out
 
 
 def write_export(
-    identification: Identification, pipeline: Pipeline, to: str, out: Path, where: str, run_dir: Path | None
+    identification: Identification, robot: RecordedRobot, to: str, out: Path, where: str, run_dir: Path | None
 ) -> None:
     """Write one file, or the folder of a card.
 
@@ -78,7 +78,7 @@ def write_export(
             hint=identification.verdict.next or f"sim2real identify {identification.pipeline}",
         )
     # Describe the source at the head of the file.
-    robot, fitting = identified_robot(identification, pipeline)
+    robot, fitting = identified_robot(identification, robot)
     model, status = robot.identifiable(fitting.max_delay_s), identification.verdict.status
     log = [("log", f"{log.path} {log.sha256}") for log in identification.logs[:1]]
     about = [("pipeline", identification.pipeline), ("verdict", status), *log, ("sim2real", version())]

@@ -9,7 +9,7 @@ from oracles.conformance import NodeConformance
 from oracles.hash_nodes import HashInJax, HashInPython, Value
 
 from sim2real.graph import BaseNode
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 
 
 def heard(node, sender):
@@ -34,13 +34,13 @@ class TestContraction(NodeConformance):
 
 class TestPendulumSensor(NodeConformance):
     def graph(self):
-        nodes = load_pipeline("pendulum").load().identifiable(0.06).nodes(0.06)
+        nodes = load_robot("pendulum").identifiable(0.06).nodes(0.06)
         return nodes, "sensor"
 
 
 class TestPendulumWorld(NodeConformance):
     def graph(self):
-        nodes = load_pipeline("pendulum").load().identifiable(0.06).nodes(0.06)
+        nodes = load_robot("pendulum").identifiable(0.06).nodes(0.06)
         return nodes, "world"
 
 

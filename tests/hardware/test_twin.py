@@ -9,7 +9,7 @@ from sim2real.emulation.servo_plant import ServoPlant
 from sim2real.errors import UsageError
 from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.dynamixel.registers import RAD_PER_COUNT
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_module, load_robot
 
 CENTRE_RAD = 2048 * RAD_PER_COUNT
 FACTORS = {"gain": 0.87, "damping": 0.252 / 0.23, "armature": 1.25, "friction": 1.5}
@@ -18,14 +18,14 @@ FACTORS = {"gain": 0.87, "damping": 0.252 / 0.23, "armature": 1.25, "friction": 
 @pytest.fixture(scope="module")
 def arguments():
     """What the arm's robot hands to a twin."""
-    robot = load_pipeline("arm").load()
+    robot = load_robot("arm")
     return robot.model.twin(robot.drive.embedded.emulator, **FACTORS).plant_args
 
 
 @pytest.fixture
 def by_hand():
     """The plant of pipelines/arm, which knows nothing of the model, with the same numbers."""
-    make = load_pipeline("arm").load("plant").ArmPlant
+    make = load_module("arm", "plant").ArmPlant
     return make(stall=0.87, back_emf=1.1, armature=1.25, coulomb=(1.5, 1.5, 1.5), bump=0.0)
 
 
@@ -78,6 +78,6 @@ def test_the_profile_is_the_hosts(arguments):
 def test_unknown_names_are_refused(arguments):
     with pytest.raises(UsageError, match="no joint 'neck'"):
         ServoPlant(**{**arguments, "joints": ["neck", "shoulder", "elbow"]})
-    robot = load_pipeline("arm").load()
+    robot = load_robot("arm")
     with pytest.raises(UsageError, match="no factor 'mass'"):
         robot.model.twin(robot.drive.embedded.emulator, mass=2.0)

@@ -13,7 +13,7 @@ from sim2real.identification.segments import Span
 from sim2real.identification.uncertainty import from_linearised
 from sim2real.stages.config import RecordConfig
 from sim2real.stages.excitation.signals import excitation
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_module, load_robot
 
 SENSOR_DELAY_S, ACTUATOR_DELAY_S, MAX_DELAY_S = 0.0207, 0.0253, 0.06
 LEAD_S = 0.00005
@@ -31,7 +31,7 @@ def synthetic_log(rng, late_s=0.0):
 
     The actuator's delay deviates by ``late_s``. Sensor and actuator run at times of their own, off any grid.
     """
-    plant = load_pipeline("pendulum").load("plant").PendulumPlant()
+    plant = load_module("pendulum", "plant").PendulumPlant()
     count, step_s = round(DURATION_S * RATE_HZ), plant.model.opt.timestep
     slots = np.arange(count) * 20_000
     sensor = slots + rng.integers(0, 900, count)
@@ -63,7 +63,7 @@ def synthetic_log(rng, late_s=0.0):
 
 
 def make_problem(episode):
-    model = load_pipeline("pendulum").load().identifiable(MAX_DELAY_S)
+    model = load_robot("pendulum").identifiable(MAX_DELAY_S)
     begins = np.arange(0.3, DURATION_S - SEGMENT_S - 0.2, SEGMENT_S)
     spans = [Span(0, float(b), i < len(begins) - 3) for i, b in enumerate(begins)]
     return Problem(model, [episode], spans, SEGMENT_S, FitConfig(max_delay_s=MAX_DELAY_S))

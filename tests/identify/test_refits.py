@@ -10,8 +10,8 @@ import pytest
 from sim2real.artifacts.identification import TriedTerm
 from sim2real.identification.held_out import REFITS, Refits
 from sim2real.stages.identify.inputs import prepare
+from sim2real.stages.load import load_robot
 from sim2real.stages.pipeline.open_log import open_recording
-from sim2real.stages.pipeline.pipeline import load_pipeline
 
 ROOT = Path(__file__).parents[2]
 TERMS, PART = ("load",), "log 1, 0 to 3 s"
@@ -79,14 +79,14 @@ def test_a_damaged_file_is_computed_again(tmp_path, text):
 
 @pytest.fixture(scope="module")
 def pendulum():
-    pipeline = load_pipeline("pendulum")
+    pipeline = load_robot("pendulum")
     logs = [open_recording(ROOT / "datasets" / "pendulum" / f"{n}.mcap", pipeline) for n in ("chirp", "multisine")]
     return pipeline, logs
 
 
 def test_the_digest_covers_logs_bounds_terms_and_settings_but_no_start(pendulum):
     pipeline, (log, other) = pendulum
-    config = replace(pipeline.identify, log=(str(log.path),))
+    config = replace(pipeline.defaults.identify, log=(str(log.path),))
     digest = prepare(pipeline, config, [log], []).digest
     assert prepare(pipeline, config, [log], [], {"gain": 20.0}).digest == digest
     assert prepare(pipeline, config, [log], [other]).digest == digest

@@ -16,7 +16,7 @@ def delays(made):
 def test_the_nominal_model_has_delays_where_they_are_given(pendulum):
     assert sum(delays(pendulum).values()) == pytest.approx(0.045)
     assert delays(robot_environment("pendulum", "nominal")) == {}
-    robot = sim2real.load_pipeline("pendulum").load()
+    robot = sim2real.load_robot("pendulum")
     assert robot_environment(robot, "nominal").env.task.values == robot.nominal()
 
 
@@ -43,7 +43,7 @@ def test_a_robot_that_shows_more_than_it_names_is_refused(pendulum):
     from sim2real.stages.train.trained_bundle import contract_of
 
     env = pendulum.env
-    contract = contract_of(sim2real.load_pipeline("pendulum").load(), env.task, {})
+    contract = contract_of(sim2real.load_robot("pendulum"), env.task, {})
     contract = replace(contract, observation=contract.observation[1:])
     with pytest.raises(UsageError, match="observation terms have 16 entries, its task shows 19"):
         RobotEnvironment(env, contract)

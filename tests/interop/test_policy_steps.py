@@ -11,7 +11,7 @@ from sim2real.errors import UsageError
 from sim2real.graph.schedule import draw
 from sim2real.interop.environments import RobotEnvironment
 from sim2real.runtime.compiled.graph import CompiledGraph
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 from sim2real.stages.train.trained_bundle import contract_of
 from sim2real.training.environment.graph_environment import GraphEnvironment
 
@@ -20,7 +20,7 @@ VALUES = {"sensor_delay": 0.02, "actuator_delay": 0.025}
 
 def robot_at(rate_hz, episode_s=0.5):
     """The pendulum, whose world ticks at 100 Hz, with a policy of another rate."""
-    robot = load_pipeline("pendulum").load()
+    robot = load_robot("pendulum")
     nodes, task = robot.training({**robot.nominal(), **VALUES}, {}, {}, True)
     for name in ("sensor", "agent", "actuator"):
         nodes[name].rate = rate_hz

@@ -19,11 +19,6 @@ from sim2real.view.timing import timing_blocks, timing_tiles
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DATA = Path(os.environ.get("SIM2REAL_DATA", REPOSITORY.parent / "shared" / "data"))
-PIPELINE = """
-from sim2real.stages.pipeline.pipeline import Pipeline
-
-PIPELINE = Pipeline(name="rig", summary="a rig", package=__name__)
-"""
 
 
 @pytest.fixture
@@ -31,7 +26,7 @@ def workplace(tmp_path, monkeypatch):
     """A working directory with a pipeline 'rig' that has a mapping, and two files to import."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "pipelines" / "rig").mkdir(parents=True)
-    (tmp_path / "pipelines" / "rig" / "__init__.py").write_text(PIPELINE)
+    (tmp_path / "pipelines" / "rig" / "__init__.py").write_text('"""A rig."""\n')
     (tmp_path / "pipelines" / "rig" / "import.toml").write_text(foreign_files.TOML)
     for name in ("one.npz", "two.npz"):
         foreign_files.npz(tmp_path / name)

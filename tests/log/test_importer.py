@@ -263,15 +263,17 @@ def test_a_timeline_needs_no_connections(file):
 
 
 def test_identification_takes_the_log(file, tmp_path, recwarn):
+    from sim2real.stages.load import load_robot
     from sim2real.stages.pipeline.open_log import open_recording
-    from sim2real.stages.pipeline.pipeline import Pipeline
 
+    robot = copy.copy(load_robot("disk"))
+    robot.name, robot.units = "rig", {}
     write_log(tmp_path / "run.mcap", import_file(file, mapping()), mapping())
-    episode = open_recording(tmp_path / "run.mcap", Pipeline("rig", "a rig", "rig")).episode
+    episode = open_recording(tmp_path / "run.mcap", robot).episode
     assert len(episode.steps["sensor"]) == COUNT
     assert not recwarn.list
     with pytest.raises(Sim2RealError, match="a log of pipeline 'rig', not of 'arm'"):
-        open_recording(tmp_path / "run.mcap", Pipeline("arm", "an arm", "arm"))
+        open_recording(tmp_path / "run.mcap", load_robot("arm"))
 
 
 def test_a_log_is_never_overwritten_and_a_failed_one_not_left(file, tmp_path):

@@ -144,8 +144,8 @@ class RecordedRobotConformance:
     pipeline, start, truth = None, (0.7, -4.0), None
 
     def model(self):
-        delay_s = self.pipeline.identify.max_delay_s
-        return self.pipeline.load().identifiable(delay_s), delay_s
+        delay_s = self.pipeline.defaults.identify.max_delay_s
+        return self.pipeline.identifiable(delay_s), delay_s
 
     def test_all_parameters_have_a_place(self):
         check_leaves(*self.model())

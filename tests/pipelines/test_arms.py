@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sim2real.robots.servo.task import ServoMoment
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_module, load_robot
 
 ARMS = {
     "arm": SimpleNamespace(there=(0.5, 0.4, 0.3), aim=(), plant="ArmPlant", more={}),
@@ -25,10 +25,10 @@ ARMS = {
 @pytest.fixture(params=ARMS)
 def of(request):
     """An arm: pipeline, robot, module, plant, and a pose at an aim."""
-    pipeline, row = load_pipeline(request.param), ARMS[request.param]
-    robot, module = pipeline.load(), pipeline.load("robot")
+    pipeline, row = load_robot(request.param), ARMS[request.param]
+    robot, module = pipeline, load_module(pipeline.name, "robot")
     there = np.array(row.there)
-    plant = getattr(pipeline.load("plant"), row.plant)()
+    plant = getattr(load_module(pipeline.name, "plant"), row.plant)()
     aim = np.array([*module.tip_of(there), *row.aim])
     return SimpleNamespace(robot=robot, module=module, plant=plant, there=there, aim=aim, more=row.more)
 

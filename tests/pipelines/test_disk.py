@@ -12,11 +12,11 @@ from scipy.optimize import least_squares
 from sim2real.identification.fit import fit
 from sim2real.identification.problem import Problem
 from sim2real.identification.segments import Span
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 
-PIPELINE = load_pipeline("disk")
+PIPELINE = load_robot("disk")
 PERIOD_S, STEP_S = 0.025, 0.0001
-MAX_DELAY_S = PIPELINE.identify.max_delay_s
+MAX_DELAY_S = PIPELINE.defaults.identify.max_delay_s
 GOOD = {
     "gain": 28.2765, "gravity": 136.105, "damping": 1.1728, "load": 0.04663, "swing": 0.10936, "cogging": 0.0,
     "voltage_offset": -0.06482, "offset": 0.04902, "eccentricity": 0.01787, "delay": 0.02495,
@@ -74,8 +74,8 @@ def synthetic():
 @pytest.fixture(scope="module")
 def fitted(synthetic):
     """The synthetic recording, identified from the nominal values, without a search: for it, ``swing`` is given."""
-    config = replace(PIPELINE.identify, generations=0, refine_steps=12, long_s=0.0)
-    model, spans = PIPELINE.load().identifiable(MAX_DELAY_S), [Span(0, float(b)) for b in np.arange(0.3, 17.5, 2.0)]
+    config = replace(PIPELINE.defaults.identify, generations=0, refine_steps=12, long_s=0.0)
+    model, spans = PIPELINE.identifiable(MAX_DELAY_S), [Span(0, float(b)) for b in np.arange(0.3, 17.5, 2.0)]
     table = model.parameters.with_fixed({"swing": TRUTH["swing"]})
     return fit(model, [synthetic.episode], spans, 2.0, config, table)
 
@@ -107,7 +107,7 @@ def test_identification_recovers(fitted, name):
 
 def test_the_model_is_the_loop(synthetic):
     """At the true values and from the true start, over 10 s, with steps of 1 ms: those of 5 ms cost 5 mrad."""
-    model, config = PIPELINE.load().identifiable(MAX_DELAY_S), replace(PIPELINE.identify, initial_state="measured")
+    model, config = PIPELINE.identifiable(MAX_DELAY_S), replace(PIPELINE.defaults.identify, initial_state="measured")
     nodes = model.nodes(MAX_DELAY_S)
     nodes["world"].substeps = 5
     model.nodes = lambda _: nodes
@@ -134,11 +134,11 @@ def recording():
 @pytest.fixture(scope="module")
 def free_run(recording):
     """125 s from one initial state, estimated from the twelve samples before."""
-    model = PIPELINE.load().identifiable(MAX_DELAY_S)
+    model = PIPELINE.identifiable(MAX_DELAY_S)
     settle_s = SETTLE * PERIOD_S
     begin_s = PAST * PERIOD_S - settle_s
     spans, length_s = [Span(0, begin_s, False)], recording.duration_s - begin_s
-    problem = Problem(model, [recording], spans, length_s, PIPELINE.identify)
+    problem = Problem(model, [recording], spans, length_s, PIPELINE.defaults.identify)
     return predictions(problem, GOOD, settle_s)[0]
 
 

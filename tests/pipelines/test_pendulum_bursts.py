@@ -10,14 +10,14 @@ from sim2real.identification.problem import Problem
 from sim2real.identification.segments import Span
 from sim2real.log.reader import read_log
 from sim2real.robots.loop import BURST
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 
 LOG = Path(__file__).parents[2] / "datasets" / "pendulum" / "steps.mcap"
 
 
 def burst_of(episode):
     """Return how many messages more than usual the window of a problem's commands holds."""
-    model = load_pipeline("pendulum").load().identifiable(0.06)
+    model = load_robot("pendulum").identifiable(0.06)
     nodes = Problem(model, [episode], [Span(0, 1.0)], 3.0).rollouts.graph.nodes
     return nodes["world"].inputs["actuator"].delay_dist.burst
 

@@ -9,18 +9,18 @@ from sim2real.emulation.virtual import VirtualRobot
 from sim2real.errors import SafetyStop
 from sim2real.hardware.joint import Joint
 from sim2real.hardware.safety.rig import Rig
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 
 HZ, SECONDS, LETS_GO_S = 50.0, 6.0, 2.5
 
 
 def play(seed, kind, **faults):
     """Swing the pendulum; return when the robot was stopped [s] and its message, and the largest deviation."""
-    pipeline = load_pipeline("pendulum")
-    robot = pipeline.load()
+    pipeline = load_robot("pendulum")
+    robot = pipeline
     emulator = robot.drive.embedded.emulator
     emulated = VirtualRobot(robot.drive.embedded.plant, replace(emulator, seed=seed, **faults))
-    truth, limits = emulated.plant.truth(), pipeline.deploy.gate.on("embedded")
+    truth, limits = emulated.plant.truth(), pipeline.defaults.deploy.gate.on("embedded")
     delay_s = emulator.sensing_latency_s + emulator.actuation_latency_s
     rng, volts, seen = np.random.default_rng(seed), 0.6, []
     following = replace(robot.model.following(truth), delay_s=delay_s)

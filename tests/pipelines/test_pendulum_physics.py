@@ -7,10 +7,10 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from sim2real.hardware.device import OperatingMode
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_module, load_robot
 
-PIPELINE = load_pipeline("pendulum")
-MODEL, PLANT = (PIPELINE.load(name) for name in ("model", "plant"))
+PIPELINE = load_robot("pendulum")
+MODEL, PLANT = (load_module(PIPELINE.name, name) for name in ("model", "plant"))
 OFF, PWM = OperatingMode.OFF, OperatingMode.PWM
 
 

@@ -14,7 +14,7 @@ from sim2real.hardware.dynamixel.device import DynamixelServos
 from sim2real.hardware.dynamixel.drive import VoltageDrive
 from sim2real.hardware.safety.gate import GateConfig
 from sim2real.hardware.safety.rig import Rig
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 
 PLANT = f"{Path(__file__).parents[1] / 'hardware' / 'plants.py'}:FirstOrder"
 """It turns at 1.8 rad/s under the push, and stays where it is without torque."""
@@ -33,5 +33,5 @@ def test_a_push_is_measured_and_its_reason_is_kept(gate, noun):
     device = DynamixelServos(BusConfig(robot.port, silence_s=1.0), [1], VoltageDrive(5.0))
     with Rig(device, GateConfig(2.0, **gate)) as rig:
         with pytest.raises(SafetyStop, match=noun):
-            load_pipeline("pendulum").load().drive.prepare(SimpleNamespace(rig=rig), 2.0)
+            load_robot("pendulum").drive.prepare(SimpleNamespace(rig=rig), 2.0)
         assert robot.bus.servos[1].get(reg.TORQUE_ENABLE) == 0

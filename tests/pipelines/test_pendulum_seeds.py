@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from sim2real.stages.identify.stage import identify
+from sim2real.stages.load import load_robot
 from sim2real.stages.pipeline.open_log import open_recording
-from sim2real.stages.pipeline.pipeline import load_pipeline
 
 LOG = Path(__file__).parents[2] / "datasets" / "pendulum" / "chirp.mcap"
 SEEDS = range(5)
@@ -17,9 +17,11 @@ pytestmark = pytest.mark.night  # five whole identifications, with five refits e
 
 
 def test_estimates_and_intervals_do_not_depend_on_the_seed():
-    pendulum = load_pipeline("pendulum")
-    recording = open_recording(LOG, pendulum, pendulum.load())
-    found = [identify(pendulum, recording, replace(pendulum.identify, seed=seed, free_run_s=0.0)) for seed in SEEDS]
+    pendulum = load_robot("pendulum")
+    recording = open_recording(LOG, pendulum)
+    found = [
+        identify(pendulum, recording, replace(pendulum.defaults.identify, seed=seed, free_run_s=0.0)) for seed in SEEDS
+    ]
     # The pendulum turns over in the held-out end alone, 2.7 times beyond the fitted motion, where this model is wrong.
     assert {own.verdict.status for own in found} == {"change the model"}
     # The log does not tell the two delays apart, only their sum.

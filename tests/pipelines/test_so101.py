@@ -11,11 +11,11 @@ from sim2real.errors import UsageError
 from sim2real.hardware.feetech import registers
 from sim2real.hardware.safety.limits import GateLimits
 from sim2real.stages.excitation.signals import excitation
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_module, load_robot
 
-PIPELINE = load_pipeline("so101")
-ROBOT, PLANT = PIPELINE.load(), PIPELINE.load("plant")
-MODULE = PIPELINE.load("robot")
+PIPELINE = load_robot("so101")
+ROBOT, PLANT = PIPELINE, load_module(PIPELINE.name, "plant")
+MODULE = load_module(PIPELINE.name, "robot")
 LOW, HIGH = np.array(ROBOT.drive.servos.low), np.array(ROBOT.drive.servos.high)
 
 
@@ -47,7 +47,7 @@ def lowest(plant, angles):
 
 def test_no_goal_leads_into_the_table(plant):
     """The gate lets no goal out of a box; everywhere in it the arm is above the table, by more than it droops."""
-    gate = ROBOT.drive.gate(PIPELINE.deploy.gate)
+    gate = ROBOT.drive.gate(PIPELINE.defaults.deploy.gate)
     np.testing.assert_array_equal(gate.range, [LOW, HIGH])
     swing = [np.linspace(LOW[i], HIGH[i], 9) for i in (1, 2, 3)]
     heights = [lowest(plant, [0, *angles, 0, 0]) for angles in itertools.product(*swing)]
@@ -56,7 +56,7 @@ def test_no_goal_leads_into_the_table(plant):
 
 
 def test_excitations_aims_and_rest_are_within_the_limits(plant):
-    signal = ROBOT.drive.around(excitation(PIPELINE.record, ROBOT.rate_hz, 6))
+    signal = ROBOT.drive.around(excitation(PIPELINE.defaults.record, ROBOT.rate_hz, 6))
     inside = (signal >= LOW - 1e-9) & (signal <= HIGH + 1e-9)
     assert inside.mean(axis=0).min() > 0.85, "the gate cuts little"
     assert np.ptp(np.clip(signal, LOW, HIGH), axis=0).min() > 0.5

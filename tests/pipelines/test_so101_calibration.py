@@ -11,10 +11,10 @@ from sim2real.emulation.truth import Kind
 from sim2real.emulation.virtual import VirtualRobot
 from sim2real.errors import HardwareLost, Sim2RealError
 from sim2real.hardware.device import OperatingMode
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_module, load_robot
 
-SO101 = load_pipeline("so101")
-GUIDE, PERSON = SO101.load("guide"), SO101.load("person")
+SO101 = load_robot("so101")
+GUIDE, PERSON = load_module(SO101.name, "guide"), load_module(SO101.name, "person")
 PLANT = f"{Path(__file__).with_name('wrong_arms.py')}:WrongArm"
 GOOD = json.loads((SO101.folder / "calibration.json").read_text())
 
@@ -107,7 +107,7 @@ def test_without_a_calibration_the_motion_makes_one(arm, tmp_path, monkeypatch):
     monkeypatch.setenv("HF_LEROBOT_CALIBRATION", str(tmp_path / "none"))
     made = tmp_path / "calibration.json"
     calibrate(new.port, GUIDE, made)
-    for joint, zero in zip(GUIDE.read(made), load_pipeline("so101").load("plant").ZERO_COUNTS, strict=True):
+    for joint, zero in zip(GUIDE.read(made), load_module("so101", "plant").ZERO_COUNTS, strict=True):
         tolerance = 200 if joint.name == "wrist_roll" else 25
         assert joint.zero_count + joint.homing_offset == pytest.approx(zero, abs=tolerance)
         assert joint.direction == 1

@@ -8,16 +8,16 @@ from recorded_robots import RecordedRobotConformance, episode, predictions, publ
 
 from sim2real.identification.problem import Problem
 from sim2real.identification.segments import Span
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_module, load_robot
 
-PIPELINE = load_pipeline("so101_log")
-MAX_DELAY_S = PIPELINE.identify.max_delay_s
+PIPELINE = load_robot("so101_log")
+MAX_DELAY_S = PIPELINE.defaults.identify.max_delay_s
 JOINTS = ("rotation", "pitch", "elbow", "wrist_pitch", "wrist_roll", "jaw")
 PERIOD_S = 0.02006
 
 
 def nominal():
-    return {p.name: p.nominal for p in PIPELINE.load().identifiable(MAX_DELAY_S).parameters}
+    return {p.name: p.nominal for p in PIPELINE.identifiable(MAX_DELAY_S).parameters}
 
 
 TRUTH = {
@@ -55,7 +55,7 @@ def simulated(v, goal, start, step_s=PERIOD_S / 100):
 
 def free_run(log):
     """Return a problem whose one segment is the recording, from rest where it was measured."""
-    model, config = PIPELINE.load().identifiable(MAX_DELAY_S), replace(PIPELINE.identify, initial_state="rest")
+    model, config = PIPELINE.identifiable(MAX_DELAY_S), replace(PIPELINE.defaults.identify, initial_state="rest")
     return Problem(model, [log], [Span(0, 0.0)], log.duration_s, config)
 
 
@@ -88,7 +88,7 @@ class TestSO101Log(RecordedRobotConformance):
 
 
 def test_every_channel_is_a_joint_of_its_own():
-    channels = PIPELINE.load().identifiable(MAX_DELAY_S).channels
+    channels = PIPELINE.identifiable(MAX_DELAY_S).channels
     assert [(c.position, c.index, c.name) for c in channels] == [("position", i, j) for i, j in enumerate(JOINTS)]
 
 
@@ -103,7 +103,7 @@ def test_the_model_is_the_loop(synthetic):
 
 
 def test_a_joint_at_its_stop_stands_there_and_the_others_move_on():
-    model = PIPELINE.load("model")
+    model = load_module(PIPELINE.name, "model")
     low = np.array(model.nominal().low)
     state = model.JointState(low + np.array([0.1, -0.1, 0.0, 0.1, -0.2, 0.1]), np.arange(-3.0, 3.0))
     stopped = model.ArmWorld("world", 200.0).confine(model.nominal(), state)

@@ -9,9 +9,9 @@ from sim2real import cli
 from sim2real.emulation.truth import Kind
 from sim2real.emulation.virtual import VirtualRobot
 from sim2real.hardware.device import OperatingMode
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_module, load_robot
 
-SO101 = load_pipeline("so101")
+SO101 = load_robot("so101")
 QUESTION = "press Enter"
 
 
@@ -19,8 +19,8 @@ QUESTION = "press Enter"
 def arm(tmp_path, monkeypatch, virtual_robots):
     """An arm whose person begins 60 s after its start."""
     hand = tmp_path / "hand.npz"
-    SO101.load("person").write_motion(hand, begin_s=60.0)
-    embedded = SO101.load("robot").embedded()
+    load_module(SO101.name, "person").write_motion(hand, begin_s=60.0)
+    embedded = load_module(SO101.name, "robot").embedded()
     monkeypatch.setenv("SO101_CALIBRATION", str(SO101.folder / "calibration.json"))
     monkeypatch.chdir(tmp_path)
     virtual_robots.append(VirtualRobot(embedded.plant, embedded.emulator, {"hand": str(hand)}, tmp_path / "truth.bin"))

@@ -10,10 +10,10 @@ from recorded_robots import RecordedRobotConformance, episode, predictions, publ
 
 from sim2real.identification.problem import Problem
 from sim2real.identification.segments import Span
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 
-PIPELINE = load_pipeline("xl330")
-MAX_DELAY_S = PIPELINE.identify.max_delay_s
+PIPELINE = load_robot("xl330")
+MAX_DELAY_S = PIPELINE.defaults.identify.max_delay_s
 MASS_KG, LENGTH_M, GRAVITY = 0.49, 0.10, 9.81
 GOOD = {
     "stall": 1.05855, "back_emf": 0.05155, "softness": 0.8548, "armature": 0.00182, "viscous": 0.00293,
@@ -57,12 +57,12 @@ def simulated(v, stamps_s, goal, kp, on, start, late_s, step_s=0.0001):
 
 def free_runs(episodes, substeps=1):
     """Return a problem whose segments are whole recordings, from rest where they were measured."""
-    model = PIPELINE.load().identifiable(MAX_DELAY_S)
+    model = PIPELINE.identifiable(MAX_DELAY_S)
     nodes = model.nodes(MAX_DELAY_S)
     nodes["world"].substeps = substeps
     model.nodes = lambda _: nodes
     spans = [Span(r, 0.0) for r in range(len(episodes))]
-    config = replace(PIPELINE.identify, initial_state="rest")
+    config = replace(PIPELINE.defaults.identify, initial_state="rest")
     return Problem(model, episodes, spans, max(e.duration_s for e in episodes), config)
 
 
@@ -103,7 +103,7 @@ def test_the_model_is_the_loop(synthetic):
 
 def test_no_seed_decides():
     """Ten seeds of a search ended between 15 and 28 mrad at a gain that was held out: refinement draws nothing."""
-    assert PIPELINE.identify.generations == 0
+    assert PIPELINE.defaults.identify.generations == 0
 
 
 @pytest.fixture(scope="module")

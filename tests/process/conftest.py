@@ -9,13 +9,13 @@ from dataclasses import asdict
 import pytest
 
 from sim2real.emulation.truth import read_truth
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 
 
 @pytest.fixture
 def lone_robot(tmp_path):
     """Start an emulated pendulum that does not end with its host; returns its port, and how to stop it."""
-    embedded = load_pipeline("pendulum").load().drive.embedded
+    embedded = load_robot("pendulum").drive.embedded
     path = tmp_path / "truth.bin"
     command = [sys.executable, "-m", "sim2real.emulation.process", "--plant", embedded.plant]
     command += ["--emulation", "sim2real.emulation.dynamixel:EmulatorConfig", "--truth", str(path)]

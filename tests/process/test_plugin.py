@@ -24,11 +24,11 @@ from pathlib import Path
 
 import sim2real
 
-turntable = sim2real.load_pipeline("turntable")
+turntable = sim2real.load_robot("turntable")
 brief = replace(turntable.identify, settle_s=0.2, horizon_s=0.4, folds=0, free_run_s=0.0)
 tiny = replace(brief, generations=0, refine_steps=3)
 recording = sim2real.Recording.load(Path({log!r}))
-found = sim2real.identify(turntable.load(), recording, replace(tiny, world="oiled", fix={{"drag": 0.0}}))
+found = sim2real.identify(turntable, recording, replace(tiny, world="oiled", fix={{"drag": 0.0}}))
 folder = Path("found")
 folder.mkdir()
 found.save(folder)
@@ -65,7 +65,7 @@ def call(site, tmp_path_factory):
 
 def test_what_it_brings_has_names(call):
     said = call("-m", "sim2real.cli", "info")
-    assert re.search(r"^turntable +a turntable on an ODrive.* entry point turntable:PIPELINE$", said, re.MULTILINE)
+    assert re.search(r"^turntable +A turntable on an ODrive.* entry point turntable$", said, re.MULTILINE)
     assert re.search(r"^odrive +entry point turntable.odrive:ODrive$", said, re.MULTILINE)
     assert re.search(r"^oiled +entry point turntable.oiled:OiledTable$", said, re.MULTILINE)
 

@@ -3,7 +3,7 @@
 import pytest
 from small_robot import PairRobot
 
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 
 
 @pytest.fixture(scope="session")
@@ -15,4 +15,4 @@ def pair():
 @pytest.fixture(scope="session")
 def arm():
     """The arm's pipeline."""
-    return load_pipeline("arm")
+    return load_robot("arm")

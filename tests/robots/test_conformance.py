@@ -4,18 +4,18 @@ import numpy as np
 import pytest
 
 from sim2real.robots import testing
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 
 
 @pytest.mark.parametrize("name", ["pendulum", "arm", "so101", "disk", "xl330", "so101_log"])
 def test_every_pipeline_here_has_a_robot(name, tmp_path, virtual_robots):
-    pipeline = load_pipeline(name)
-    testing.check_robot(pipeline.load(), tmp_path, pipeline.record.gate)
+    pipeline = load_robot(name)
+    testing.check_robot(pipeline, tmp_path, pipeline.defaults.record.gate)
 
 
 def pendulum(part=None, **changes):
     """Return the pendulum with other attributes of itself or of one of its parts."""
-    robot = load_pipeline("pendulum").load()
+    robot = load_robot("pendulum")
     if part is None:
         return type("Changed", (type(robot),), changes)()
     robot = type(robot)()
@@ -49,7 +49,7 @@ def too_strong(robot, values, draws, computation, delays):
         ),
         (
             "agent",
-            {"observation": load_pipeline("pendulum").load().agent.observation[:2]},
+            {"observation": load_robot("pendulum").agent.observation[:2]},
             r"an observation has shape \(19,\), not \(15,\)",
         ),
     ],

@@ -10,7 +10,7 @@ import pytest
 from sim2real.emulation.virtual import VirtualRobot
 from sim2real.errors import SafetyStop
 from sim2real.hardware.safety.rig import Rig
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 
 HZ, SECONDS, LETS_GO_S = 50.0, 4.0, 2.5
 SHARES = {"arm": (0.5, 0.8, 0.8), "so101": (0.5, 0.8, 0.3, 0.5, 0.5, 0.5)}
@@ -21,10 +21,10 @@ class Arm:
     """An embedded arm of a pipeline, and its model with the values that an identification finds."""
 
     def __init__(self, name):
-        pipeline, self.shares = load_pipeline(name), np.array(SHARES[name])
-        robot = pipeline.load()
+        pipeline, self.shares = load_robot(name), np.array(SHARES[name])
+        robot = pipeline
         self.drive, self.servos, self.model = robot.drive, robot.drive.servos, robot.model
-        self.limits = pipeline.deploy.gate.on("embedded")
+        self.limits = pipeline.defaults.deploy.gate.on("embedded")
         truth = self.robot(0).plant.truth()
         values = {p.name: float(truth.get(p.name, p.begin)) for p in self.model.dynamics()}
         self.following = self.model.following(values)

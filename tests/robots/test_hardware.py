@@ -15,9 +15,8 @@ from sim2real.hardware.safety.limits import GateLimits
 from sim2real.log.reader import read_log
 from sim2real.robots.messages import Goals
 from sim2real.robots.nodes import Excitation
+from sim2real.stages.load import load_robot, moving
 from sim2real.stages.on_robot.episode import run_episode
-from sim2real.stages.pipeline.load_robot import moving_robot
-from sim2real.stages.pipeline.pipeline import load_pipeline
 
 GATE = GateLimits(limit=1.5, slew_per_s=6.0, command_timeout_s=0.2, max_speed_rad_s=20.0, servo_watchdog_s=0.6)
 SIGNAL = np.concatenate([np.zeros((5, 3)), np.tile([0.3, 0.6, -0.4], (20, 1)), np.tile([0.2, 1.45, 0.1], (10, 1))])
@@ -43,24 +42,23 @@ class Steady:
         return self.action
 
 
-def changed(pipeline, **servos):
+def changed(robot, **servos):
     """Return the arm, set up otherwise."""
-    robot = pipeline.load()
     return type(robot)(replace(robot.drive.servos, **servos))
 
 
-def with_drive(pipeline, **settings):
+def with_drive(robot, **settings):
     """Return the arm with servos that are set up otherwise on the bus."""
-    sheet = pipeline.load().drive.servos.sheet
+    sheet = robot.drive.servos.sheet
     drive = replace(sheet.drive, **settings)
     kind = type("Sheet", (type(sheet),), {"drive": drive})
-    return changed(pipeline, sheet=kind(**asdict(sheet)))
+    return changed(robot, sheet=kind(**asdict(sheet)))
 
 
 @pytest.fixture(scope="module")
 def episodes(arm, tmp_path_factory):
     """A recording of 1 s and a deployment of 0.6 s on one open robot, and what was true."""
-    folder, robot = tmp_path_factory.mktemp("arm"), arm.load()
+    folder, robot = tmp_path_factory.mktemp("arm"), arm
     truth, logs = folder / "truth.bin", (folder / "recorded.mcap", folder / "deployed.mcap")
     policy = Steady([1.0, -0.5, 0.25])
     with virtual_stages(), robot.drive.connect("embedded", GATE, truth, 3) as session:
@@ -68,10 +66,10 @@ def episodes(arm, tmp_path_factory):
         config = Config()
         robot.drive.prepare(session, 5.0)
         nodes = robot.recording_nodes(session, SIGNAL)
-        recorded = run_episode(arm, robot, session, nodes, {}, logs[0], 1.0, config, "record")
+        recorded = run_episode(robot, session, nodes, {}, logs[0], 1.0, config, "record")
         robot.drive.prepare(session, 10.0)
         nodes, params = robot.deployment_nodes(session, policy, trial=2)
-        deployed = run_episode(arm, robot, session, nodes, params, logs[1], 0.6, config, "deploy")
+        deployed = run_episode(robot, session, nodes, params, logs[1], 0.6, config, "deploy")
         left = session.rig.wait_until_still(5.0).position_rad
         robot.drive.prepare(session, 10.0)
         brought = session.rig.measure().position_rad
@@ -203,7 +201,7 @@ def test_a_robot_without_an_embedded_twin_has_no_such_port(pair, tmp_path):
 @pytest.mark.parametrize("name", ["go2", "so101", "arm", "pendulum"])
 def test_no_command_leaps_where_a_recording_outlasts_its_excitation(name):
     """A Go2 on its feet was told to stretch all legs for the last one or two steps of each log of its load."""
-    robot = moving_robot(load_pipeline(name))
+    robot = moving(load_robot(name))
     rest = SimpleNamespace(position_rad=np.full(len(robot.agent.action), 0.1))
     session = SimpleNamespace(rig=SimpleNamespace(measure=lambda: rest, wait_until_still=lambda *_: rest))
     signal = 0.5 + 0.1 * np.linspace(0.0, 1.0, 100)[:, None] * np.ones(len(robot.agent.action))

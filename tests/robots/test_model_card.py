@@ -28,7 +28,7 @@ from sim2real.stages.config import RecordConfig
 from sim2real.stages.excitation.signals import excitation
 from sim2real.stages.excitation.simulated_log import simulate
 from sim2real.stages.export import facts_of, write_model_card
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 
 ROOT = Path(__file__).resolve().parents[2]
 ALONE = """
@@ -95,7 +95,7 @@ def check(folder):
 def test_the_pendulum_of_a_real_recording(tmp_path):
     values = {"gain": 21.08, "gravity": 112.7, "damping": 0.748, "friction": 8.458, "sensor_delay": 0.0223,
               "actuator_delay": 0.0223}  # fmt: skip
-    robot = load_pipeline("pendulum").load()
+    robot = load_robot("pendulum")
     found = known(robot, read_log(ROOT / "datasets" / "pendulum" / "multisine.mcap"), values, (15.0, 16.0, 17.0, 18.0))
     check(card_of(robot, found, tmp_path / "card"))
 
@@ -103,8 +103,8 @@ def test_the_pendulum_of_a_real_recording(tmp_path):
 @pytest.mark.night
 def test_the_so101_whose_friction_wears_off_with_speed(tmp_path):
     """A log of the model at other parameters than those of the card, read in counts."""
-    pipeline = load_pipeline("so101")
-    robot = pipeline.load()
+    pipeline = load_robot("so101")
+    robot = pipeline
     model = robot.identifiable(MAX_DELAY_S)
     truth = {p.name: p.nominal for p in model.parameters} | {"sensor_delay": 0.008, "actuator_delay": 0.012}
     signal = robot.drive.around(excitation(RecordConfig(duration_s=6.0, amplitude=0.4), robot.rate_hz, 6))
@@ -232,7 +232,7 @@ def test_a_card_without_a_simulation_has_the_reason(tmp_path):
     folder = card_of(robot, replace(found, replays={}), tmp_path / "old")
     assert "no commands (replays.npz)" in (folder / "card.json").read_text()
     assert alone(folder)[0] == 0
-    disk = load_pipeline("disk").load()
+    disk = load_robot("disk")
     rows = tuple(
         Estimate(p.name, p.unit, p.kind, "", p.nominal, p.nominal, "fixed") for p in disk.identifiable(0.06).parameters
     )

@@ -17,8 +17,8 @@ from sim2real.identification.segments import Span
 from sim2real.log.reader import read_log
 from sim2real.stages.config import RecordConfig
 from sim2real.stages.excitation.signals import excitation
+from sim2real.stages.load import load_robot
 from sim2real.stages.on_robot.episode import run_episode
-from sim2real.stages.pipeline.pipeline import load_pipeline
 
 PATIENT = GateLimits(command_timeout_s=0.2, servo_watchdog_s=0.6)
 GEARS = (2.0, 0.5)
@@ -45,14 +45,14 @@ def test_a_twins_servos_are_those_of_the_data_sheet_whatever_their_gears(pair):
 
 def test_goals_and_limits_are_the_joints_on_the_bus_too(arm, tmp_path, virtual_robots):
     """The servos turn up to twice as far, some of them the other way; the true joints go where they are told."""
-    robot = arm.load()
+    robot = arm
     joints = (Joint("pan", 0.5, -1, 1.5), Joint("shoulder", -0.2, 1, 2.0), Joint("elbow", 0.1, -1, 0.8))
     robot = type(robot)(replace(robot.drive.servos, joints=joints))
     goal = np.array([0.4, -0.3, 0.5])
     with robot.drive.connect("embedded", PATIENT, tmp_path / "truth.bin", 0) as session:
         robot.drive.prepare(session, 5.0)
         nodes = robot.recording_nodes(session, np.tile(goal, (90, 1)))
-        run_episode(arm, robot, session, nodes, {}, tmp_path / "log.mcap", 1.6, RecordConfig(), "record")
+        run_episode(robot, session, nodes, {}, tmp_path / "log.mcap", 1.6, RecordConfig(), "record")
     episode, truth = read_log(tmp_path / "log.mcap"), read_truth(tmp_path / "truth.bin")
     position = episode.outputs["sensor"]["position"]
     np.testing.assert_allclose(episode.outputs["actuator"]["goal"][-1], goal, atol=1e-6)
@@ -69,18 +69,18 @@ def test_goals_and_limits_are_the_joints_on_the_bus_too(arm, tmp_path, virtual_r
 @pytest.mark.night  # test_mounting.py has each reading and command, the test above goals and limits
 def test_what_is_identified_does_not_depend_on_how_the_joint_is_mounted(tmp_path, virtual_robots):
     """The log of a pendulum whose motor turns twice the other way gives the parameters of the pendulum's plant."""
-    pipeline = load_pipeline("pendulum")
-    robot = type(pipeline.load())((Joint("hinge", 0.7, -1, 2.0),))
+    pipeline = load_robot("pendulum")
+    robot = type(pipeline)((Joint("hinge", 0.7, -1, 2.0),))
     config = RecordConfig(duration_s=8.0, amplitude=2.0, low_hz=0.7, high_hz=2.0, gate=PATIENT)
     log, truth = tmp_path / "log.mcap", tmp_path / "truth.bin"
     with robot.drive.connect("embedded", PATIENT, truth, 1) as session:
         nodes = robot.recording_nodes(session, excitation(config, 50.0, 1))
-        run_episode(pipeline, robot, session, nodes, {}, log, config.duration_s, config, "record")
+        run_episode(robot, session, nodes, {}, log, config.duration_s, config, "record")
     episode, true = read_log(log), read_truth(truth)
     assert np.ptp(episode.outputs["sensor"]["th"]) > 1.0
     samples = true.of(Kind.SAMPLE)["values"]
     np.testing.assert_allclose(samples[0, 0], 0.7 - 2.0 * np.pi, atol=1e-6)  # that is what the encoder says at pi
-    how = replace(pipeline.identify, generations=0, initial_state="measured")
+    how = replace(pipeline.defaults.identify, generations=0, initial_state="measured")
     spans = [Span(0, begin_s) for begin_s in (0.3, 2.0, 3.7, 5.4)]
     found = fit(robot.identifiable(0.06), [episode], spans, 1.5, how).values
     # A wrong mounting is a factor of 2 or 4.

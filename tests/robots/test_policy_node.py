@@ -10,7 +10,7 @@ from sim2real.policy import ActionTerm, PolicyContract
 from sim2real.policy.bundle import make_runner
 from sim2real.robots.loop import SENSOR
 from sim2real.robots.nodes import PolicyNode, in_numpy
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 from sim2real.training.networks.policy import Policy
 
 STEPS = 4
@@ -18,7 +18,7 @@ STEPS = 4
 
 @pytest.fixture(scope="module", params=["pendulum", "arm", pytest.param("so101", marks=pytest.mark.night)])
 def robot(request):
-    return load_pipeline(request.param).load()
+    return load_robot(request.param)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from sim2real.emulation.plant import load_plant
 from sim2real.errors import Sim2RealError
 from sim2real.hardware.device import OperatingMode
 from sim2real.robots.probe import delays_of
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 
 T_S = np.arange(0.0, 0.16, 0.004)
 COUNT_RAD = 2 * np.pi / 4096
@@ -95,7 +95,7 @@ def answers_of(plant, step, mode, settings=()):
 )
 def test_the_lag_of_a_robot_holds_at_half_and_at_twice_its_friction(name, arguments, mode, settings):
     """It was one number, measured on the embedded robot, and decided on the real one."""
-    drive = load_pipeline(name).load().drive
+    drive = load_robot(name).drive
     plant = load_plant(drive.embedded.plant, arguments)
     step = drive.probe.step if mode == OperatingMode.POSITION else drive.probe.step / 5.0
     found = replace(delays_of(answers_of(plant, step, mode, settings)), lag_s=drive.probe.lag_s)

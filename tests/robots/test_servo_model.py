@@ -14,7 +14,7 @@ from sim2real.hardware.joint import Joint
 from sim2real.identification.rollouts import choose_engine
 from sim2real.robots.messages import EpisodeStart
 from sim2real.robots.servo.model import ServoModel, servo_parameters
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 from sim2real.stages.shared.identification import with_wanted_terms
 
 GEARS = (2.0, 0.5)
@@ -66,7 +66,7 @@ def test_friction_that_wears_off_lets_a_joint_move_faster():
 
 @pytest.mark.parametrize("name", ["arm", "so101"])
 def test_parameters_are_in_the_graph_as_in_the_exported_model(name):
-    robot = load_pipeline(name).load()
+    robot = load_robot(name)
     values = robot.nominal() | {"payload": 0.1, "damping": 0.3, "goal_offset_elbow_flex": 0.02}
     exported = mujoco.MjModel.from_xml_string(robot.identified_mjcf(values))
     for field, numbers in robot.model.fields(values).items():
@@ -120,7 +120,7 @@ def test_a_model_without_a_servos_joint_is_refused(tmp_path):
 
 
 def test_a_payload_is_identified_where_it_is_asked_for_and_always_watched():
-    arm = load_pipeline("arm").load()
+    arm = load_robot("arm")
     identified, watched = arm.identifiable(0.06).parameters, arm.watched(0.06).parameters
     free = {p.name for p in identified if p.free}
     assert {p.name for p in watched if p.free} - free == {"payload"}
@@ -130,13 +130,13 @@ def test_a_payload_is_identified_where_it_is_asked_for_and_always_watched():
 
 @pytest.mark.parametrize("name", ["arm", "so101"])
 def test_a_hand_weighs_something_whatever_it_holds(name):
-    robot = load_pipeline(name).load()
+    robot = load_robot(name)
     fields = robot.model.fields(robot.nominal() | {"payload": robot.model.hand.least_kg})
     assert np.asarray(fields["body_mass"])[1:].min() > 0.005
 
 
 def test_a_robot_that_is_first_asked_while_jax_traces_keeps_no_tracer():
-    robot = type(load_pipeline("arm").load())()
+    robot = type(load_robot("arm"))()
     values, still = robot.nominal(), np.zeros(3)
 
     def mass(kg):
@@ -150,7 +150,7 @@ def test_c_is_taken_where_it_can_be(pair):
     model = pair.identifiable(0.03)
     for wanted, name in (("auto", "c"), ("compiled", "compiled")):
         assert choose_engine(wanted, model.nodes(0.03), model.given).name == name
-    disk = load_pipeline("disk").load().identifiable(0.06)
+    disk = load_robot("disk").identifiable(0.06)
     motor = disk.nodes(0.06), disk.given
     assert choose_engine("auto", *motor).name == "compiled"
     with pytest.raises(UsageError, match="engine c: the world is not one of MuJoCo's"):

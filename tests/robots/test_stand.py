@@ -20,7 +20,7 @@ from sim2real.identification.predictions import labels
 from sim2real.identification.problem import Problem
 from sim2real.identification.segments import Span
 from sim2real.robots.walking.twin import twin_of
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import defaults_of
 from sim2real.stages.shared.identification import spans
 
 SEED, SECONDS, SEGMENT_S = 5, 2.0, 0.8
@@ -76,7 +76,7 @@ def test_a_log_of_a_robot_that_moves_is_refused(log):
 
 def test_the_way_of_the_legs_to_the_excitation_is_not_fitted(log):
     episode, _ = log
-    config = replace(load_pipeline("go2").identify, settle_s=0.1, horizon_s=0.2)
+    config = replace(defaults_of("go2").identify, settle_s=0.1, horizon_s=0.2)
     assert config.after_s == 2.0
     for after_s, begin_s in ((0.7, 0.7), (0.0, 0.3)):
         cut = spans([episode], 1, replace(config, after_s=after_s), 0.3)

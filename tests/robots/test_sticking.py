@@ -15,7 +15,7 @@ from sim2real.robots.model.file import read_model
 from sim2real.robots.model.parameters import usual_patterns
 from sim2real.robots.model.robot import MjcfRobot, RobotConfig
 from sim2real.robots.servo.world import ServoParams, ServoWorld
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 
 XML = """<mujoco><worldbody><body><joint name="lift" axis="0 1 0" frictionloss="1" {own}/>
 <inertial pos="0.1 0 0" mass="0.5" diaginertia="1e-3 1e-3 1e-3"/></body></worldbody></mujoco>"""
@@ -66,7 +66,7 @@ def test_the_identified_model_holds_its_joints_as_the_identification_did(model_f
 @pytest.mark.parametrize("name", ["so101", "arm"])
 def test_an_exported_servo_robot_rests_where_friction_holds_it(name):
     """With a single iteration of the solver, as in training, its joints shiver and creep."""
-    robot = load_pipeline(name).load()
+    robot = load_robot(name)
     model = mujoco.MjModel.from_xml_string(robot.identified_mjcf(robot.nominal()))
     model.opt.gravity[:], model.dof_frictionloss[:] = 0.0, 0.2
 
@@ -88,7 +88,7 @@ def test_an_exported_servo_robot_rests_where_friction_holds_it(name):
 @pytest.mark.parametrize("name", ["so101", "arm"])
 def test_in_single_precision_too(name):
     """On MJX, as beside a deployment; at an impedance of 0.999 single precision does not find the holding force."""
-    robot = load_pipeline(name).load()
+    robot = load_robot(name)
     model = copy(robot.model.model)
     model.opt.gravity[:] = 0.0
     profiles = [robot.model.profile_rad_s] * model.nq

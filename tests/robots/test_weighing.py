@@ -19,7 +19,7 @@ from sim2real.emulation.truth import read_truth
 from sim2real.errors import OtherMotion, UsageError
 from sim2real.robots.walking import weighing
 from sim2real.stages.identify.inputs import with_load
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 from sim2real.training.environment.draws import draw_robots
 from sim2real.training.environment.variation import VariationConfig
 
@@ -173,7 +173,7 @@ def test_logs_that_are_not_of_a_robot_on_its_feet_are_refused(tmp_path, standing
     with pytest.raises(OtherMotion, match="not stand upright"):
         weighing.check(ROBOT, changed(episode, "sensor", quaternion=turned), values)
     with pytest.raises(UsageError, match="does not stand on legs"):
-        weighing.check(load_pipeline("pendulum").load(), episode, values)
+        weighing.check(load_robot("pendulum"), episode, values)
 
 
 def test_the_legs_bend_slowly_towards_the_folded_ones():

@@ -10,7 +10,7 @@ import pytest
 from sim2real.errors import UsageError
 from sim2real.identification.parameters import Parameter
 from sim2real.robots.robot import RecordedRobot, RobotModel, checked, in_world
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 
 PLUGIN = Path(__file__).parents[1] / "plugin"
 VALUES = {"loop": 20.0, "friction": 3.0, "drag": 4.0, "sensor_delay": 0.004, "actuator_delay": 0.011}
@@ -107,7 +107,7 @@ def test_the_curriculum_reaches_the_task_of_a_robot_in_another_world(table, monk
 
 
 def test_a_recorded_robot_keeps_its_sensors_parameters_and_start(installed):
-    disk = load_pipeline("disk").load()
+    disk = load_robot("disk")
     model, own = in_world(disk, "halved").identifiable(0.1), disk.identifiable(0.1)
     assert model.parameters.names == ("gain", "offset", "eccentricity", "delay")
     values = {p.name: p.nominal for p in own.parameters}
@@ -129,16 +129,16 @@ def test_a_recorded_robot_keeps_its_sensors_parameters_and_start(installed):
 )
 def test_what_makes_no_world_is_refused(installed, name, said):
     with pytest.raises(UsageError, match=said):
-        in_world(load_pipeline("disk").load(), name)
+        in_world(load_robot("disk"), name)
 
 
 def test_ticks_between_the_samples_of_recordings_are_refused(installed):
     with pytest.raises(UsageError, match="230 ticks a second, that of these recordings 200"):
-        in_world(load_pipeline("disk").load(), "fast").identifiable(0.1).nodes(0.1)
+        in_world(load_robot("disk"), "fast").identifiable(0.1).nodes(0.1)
 
 
 def test_a_robot_that_makes_its_nodes_itself_stays_in_its_world(installed):
-    disk = load_pipeline("disk").load()
+    disk = load_robot("disk")
     nodes = {"units": disk.units, "identifiable": lambda self, max_delay_s: None, "make_nodes": disk.make_nodes}
     with pytest.raises(UsageError, match="Own makes its nodes itself"):
         in_world(type("Own", (RecordedRobot,), nodes)(), "halved")

@@ -14,7 +14,7 @@ from sim2real.artifacts.run import STAGES, TAKES, Source, attempts, newest, open
 from sim2real.commands.loop import run_all
 from sim2real.commands.run import RunFlags
 from sim2real.errors import Sim2RealError
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 
 TRIP = Estimate(ROUND_TRIP, "s", "derived", "", 0.0, 0.02, "ok")
 FRICTION = Changed("friction", "rad/s^2", 6.0, 12.0, 11.0, 13.0, 0.9, 1e-20)
@@ -92,11 +92,11 @@ class Stages:
 
     def run(self, iterations=5, resume=None, train=None, deploy=None, **told):
         """Run; return the run folder."""
-        pipeline = load_pipeline("pendulum")
-        stages = {stage: getattr(pipeline, stage) for stage in STAGES}
-        stages["train"] = replace(pipeline.train, **(train or {}))
-        stages["deploy"] = deploy or pipeline.deploy
+        robot = load_robot("pendulum")
+        stages = {stage: getattr(robot.defaults, stage) for stage in STAGES}
+        stages["train"] = replace(robot.defaults.train, **(train or {}))
+        stages["deploy"] = deploy or robot.defaults.deploy
         flags = RunFlags(iterations=iterations, runs=self.root, resume=resume, **stages, **told)
-        run_all(pipeline, flags, self)
+        run_all(robot, flags, self)
         (run_dir,) = (self.root / "pendulum").iterdir()
         return run_dir

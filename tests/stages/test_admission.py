@@ -1,5 +1,6 @@
 """What deploy refuses to run."""
 
+import copy
 import json
 from dataclasses import replace
 from types import SimpleNamespace
@@ -14,7 +15,7 @@ from sim2real.policy import PolicyContract, save_bundle
 from sim2real.robots.probe import StepAnswers, Witness
 from sim2real.stages.config import DeployConfig
 from sim2real.stages.deploy import episodes, preflight
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 
 TRAINED = (0.044, 0.046)
 
@@ -41,13 +42,14 @@ def contract_of(robot, /, **changes):
 
 
 def admit(robot, contract, name="arm", **config):
-    pipeline = replace(load_pipeline("arm"), name=name)
-    preflight.require_fit(pipeline, robot, Bundle(contract, still(contract)), DeployConfig(**config))
+    robot = copy.copy(robot)
+    robot.name, robot.folder = name, load_robot("arm").folder
+    preflight.require_fit(robot, Bundle(contract, still(contract)), DeployConfig(**config))
 
 
 @pytest.fixture(scope="module")
 def arm():
-    return load_pipeline("arm").load()
+    return load_robot("arm")
 
 
 def test_a_policy_for_the_robot_is_let_in(arm):
@@ -85,7 +87,7 @@ def test_a_policy_for_another_robot_is_refused(arm, what):
 
 
 def test_a_pendulum_policy_may_not_ask_for_100_volts():
-    robot = load_pipeline("pendulum").load()
+    robot = load_robot("pendulum")
     contract = contract_of(robot, action=(replace(robot.agent.action[0], low=-100.0, high=100.0),))
     with pytest.raises(Sim2RealError, match="this robot allows -2 to 2"):
         admit(robot, contract)
@@ -157,7 +159,7 @@ def test_delay_and_jitter_must_be_those_of_the_training(delay_s, varies_s, said)
 def test_a_delay_that_was_not_trained_is_refused_or_with_force_told(arm, monkeypatch, capsys, force):
     monkeypatch.setattr(episodes, "measure_delay", lambda witness, probe: StepAnswers(np.full(8, 0.060)))
     witness = Witness(SimpleNamespace(wait_until_still=lambda timeout_s: None))
-    pendulum = load_pipeline("pendulum").load()
+    pendulum = load_robot("pendulum")
     contract = contract_of(pendulum, trained_s={"round_trip_delay": TRAINED})
     if force:
         found = episodes.check_delay(pendulum, witness, contract, DeployConfig(force=True))

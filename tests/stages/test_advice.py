@@ -8,17 +8,17 @@ import pytest
 
 from sim2real.commands import flags
 from sim2real.commands.stages import StageFlags
-from sim2real.stages.pipeline.pipeline import load_pipeline, pipeline_of
+from sim2real.stages.load import defaults_of, load_robot, robot_of
 from sim2real.stages.shared.identification import command, continuing
 
-ARM = load_pipeline("arm")
+ARM = load_robot("arm")
 
 
 def parsed(text):
     """Return what the command line makes of a printed command: the pipeline, and its flags."""
     program, stage, pipeline, *rest = shlex.split(text)
     assert (program, stage) == ("sim2real", "identify")
-    return pipeline, flags.parse(StageFlags(ARM.identify), rest, "sim2real identify", "")
+    return pipeline, flags.parse(StageFlags(ARM.defaults.identify), rest, "sim2real identify", "")
 
 
 @pytest.mark.parametrize(
@@ -32,7 +32,7 @@ def parsed(text):
 )
 def test_what_was_asked_before_is_asked_again_with_what_is_new(new, bounds, fix, max_delay_s):
     before = replace(
-        ARM.identify,
+        ARM.defaults.identify,
         log=("my log.mcap", "b.mcap"),
         hold_out=("c.mcap",),
         bounds={"gain": (1.0, 4.0), "mass": (0.1, 0.4000000123)},
@@ -49,8 +49,8 @@ def test_what_was_asked_before_is_asked_again_with_what_is_new(new, bounds, fix,
 
 
 def test_a_robot_of_python_alone_gets_no_command_that_does_not_find_it():
-    own = pipeline_of(type("Spare", (type(ARM.load()),), {})())
-    said = continuing(own, own.identify, Path("runs"), Path("runs/my robot/partial.json"))
+    own = robot_of(type("Spare", (type(ARM),), {})())
+    said = continuing(own, defaults_of(own).identify, Path("runs"), Path("runs/my robot/partial.json"))
     call = "sim2real.identify(robot, recording, ...)"
     assert said.startswith(f"{call} with the settings --begin 'runs/my robot/partial.json'")
-    assert command(own, own.identify, Path("runs")) == call
+    assert command(own, defaults_of(own).identify, Path("runs")) == call

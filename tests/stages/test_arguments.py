@@ -29,13 +29,13 @@ RECORDING = Recording(Path("session.mcap"), EPISODE)
 
 @pytest.fixture(scope="module")
 def pendulum():
-    return sim2real.load_pipeline("pendulum")
+    return sim2real.load_robot("pendulum")
 
 
 @pytest.mark.parametrize(
     ("call", "said"),
     [
-        (lambda p: sim2real.record(3, "folder"), "3 is neither a robot nor a pipeline"),
+        (lambda p: sim2real.record(3, "folder"), "3 is no robot"),
         (lambda p: sim2real.record("pendulm", "folder"), "unknown pipeline 'pendulm'"),
         (lambda p: sim2real.record(p, None), "folder must be the path of a folder; got NoneType"),
         (lambda p: sim2real.record(p, "folder", DeployConfig()), "of type RecordConfig; got DeployConfig"),
@@ -75,11 +75,11 @@ def test_what_is_wrong_is_said_before_anything_happens(pendulum, call, said, tmp
 
 def test_a_dict_of_what_is_different_is_a_configuration(pendulum):
     given = {"episode_s": 2.0, "ppo": {"num_envs": 64}}
-    own = replace(pendulum.train, episode_s=2.0, ppo=replace(pendulum.train.ppo, num_envs=64))
-    assert python_arguments.config_of(given, pendulum.train) == own
-    assert python_arguments.config_of(None, pendulum.train) is pendulum.train
+    own = replace(pendulum.defaults.train, episode_s=2.0, ppo=replace(pendulum.defaults.train.ppo, num_envs=64))
+    assert python_arguments.config_of(given, pendulum.defaults.train) == own
+    assert python_arguments.config_of(None, pendulum.defaults.train) is pendulum.defaults.train
     with pytest.raises(UsageError):
-        python_arguments.config_of({"held_out": 2.0, "log": ()}, pendulum.identify)
+        python_arguments.config_of({"held_out": 2.0, "log": ()}, pendulum.defaults.identify)
 
 
 @pytest.mark.parametrize("kind", [str, Path])

@@ -9,8 +9,8 @@ from shared_run import copied
 
 from sim2real import cli, errors
 from sim2real.policy.bundle import sealed
+from sim2real.stages.load import load_robot
 from sim2real.stages.pipeline.open_parameters import open_identification
-from sim2real.stages.pipeline.pipeline import load_pipeline
 
 
 @pytest.fixture
@@ -171,7 +171,7 @@ def test_damaged_parameters(fails, tmp_path, finished_run_dir):
 
 
 def test_parameters_that_are_whole_are_read(finished_run_dir):
-    found = open_identification(finished_run_dir / "identify" / "parameters.json", load_pipeline("pendulum"))
+    found = open_identification(finished_run_dir / "identify" / "parameters.json", load_robot("pendulum"))
     assert np.isfinite(list(found.values.values())).all()
 
 

@@ -26,8 +26,8 @@ from sim2real.stages.check.stage import (
 from sim2real.stages.config import RecordConfig
 from sim2real.stages.excitation.signals import excitation
 from sim2real.stages.excitation.simulated_log import simulate
+from sim2real.stages.load import load_robot
 from sim2real.stages.pipeline.open_log import open_recording
-from sim2real.stages.pipeline.pipeline import load_pipeline
 
 LOG = Path(__file__).parents[2] / "datasets" / "pendulum" / "multisine.mcap"
 JOINT = JointCoverage("th", "rad", -1.0, 1.0, 3.0, Motion(0.9, 0.5, 30))
@@ -129,11 +129,11 @@ def test_an_error_with_jax_is_not_reported_as_a_missing_package(monkeypatch):
 
 
 def test_what_is_planned_is_simulated_from_where_the_robot_hangs():
-    pipeline = load_pipeline("pendulum")
-    robot = pipeline.load()
+    pipeline = load_robot("pendulum")
+    robot = pipeline
     model = robot.identifiable(0.06)
     record = RecordConfig(duration_s=2.0, amplitude=1.0, low_hz=0.7, high_hz=2.0)
-    table, fitting = model.parameters, replace(pipeline.identify, max_delay_s=0.06)
+    table, fitting = model.parameters, replace(pipeline.defaults.identify, max_delay_s=0.06)
     signal = excitation(record, robot.rate_hz).reshape(-1, 1)
     episode = simulate(model, robot, signal, table.decode(table.start()), fitting)
     th = episode.outputs["sensor"]["th"]
@@ -145,7 +145,7 @@ def test_what_is_planned_is_simulated_from_where_the_robot_hangs():
 
 
 def test_commands_of_several_joints_have_their_names():
-    model = load_pipeline("arm").load().identifiable(0.06)
+    model = load_robot("arm").identifiable(0.06)
     names = [channel.name for channel in model.channels]
     ((node, message),) = model.given.items()
     t = np.arange(200) / 50.0
@@ -170,11 +170,11 @@ def test_a_plan_and_a_log_exclude_each_other():
 
 
 def test_segments_lie_side_by_side_and_are_not_too_many(judged):
-    pipeline = load_pipeline("pendulum")
+    pipeline = load_robot("pendulum")
     episode = open_recording(LOG, pipeline).episode
-    spans, length_s = check_stage.cut_segments([episode], pipeline.identify)
+    spans, length_s = check_stage.cut_segments([episode], pipeline.defaults.identify)
     assert len(spans) == judged[1]["segments"]
     assert np.diff([s.begin_s for s in spans]) == pytest.approx(length_s)
-    many, _ = check_stage.cut_segments([episode] * 20, pipeline.identify)
+    many, _ = check_stage.cut_segments([episode] * 20, pipeline.defaults.identify)
     assert len(many) == 120
     assert {s.recording for s in many} == set(range(20))

@@ -23,7 +23,7 @@ from sim2real.commands import loop
 from sim2real.commands.run import RunFlags
 from sim2real.robots.loop import DELAYS
 from sim2real.stages.deploy.verdict import judge
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
 from benches.hidden import randomise
@@ -35,20 +35,20 @@ MORE_S = 0.030
 
 def tiny(pipeline):
     """Return each stage's configuration, with budgets of seconds."""
-    ppo = replace(pipeline.train.ppo, total_steps=512, num_envs=16, minibatches=2, evaluations=1)
+    ppo = replace(pipeline.defaults.train.ppo, total_steps=512, num_envs=16, minibatches=2, evaluations=1)
     train = {"episode_s": 2.0, "timelines": 4, "force": True, "sensitivity": False, "ppo": ppo}
     return {
-        "record": replace(pipeline.record, duration_s=12.0),
-        "identify": replace(pipeline.identify, generations=10, population=8, folds=0, free_run_s=0.0),
-        "train": replace(pipeline.train, **train),
-        "deploy": replace(pipeline.deploy, episodes=1, duration_s=4.0),
+        "record": replace(pipeline.defaults.record, duration_s=12.0),
+        "identify": replace(pipeline.defaults.identify, generations=10, population=8, folds=0, free_run_s=0.0),
+        "train": replace(pipeline.defaults.train, **train),
+        "deploy": replace(pipeline.defaults.deploy, episodes=1, duration_s=4.0),
     }
 
 
 @pytest.fixture
 def world(tmp_path, finished_run_dir):
     """A robot, and a function that runs its stages: the robot becomes later when the first policy was trained."""
-    pipeline, root = load_pipeline("pendulum"), tmp_path / "runs"
+    pipeline, root = load_robot("pendulum"), tmp_path / "runs"
     later = replace(shared_run.ROBOT, acting=shared_run.ROBOT.acting + MORE_S)
 
     def first(name):

@@ -10,7 +10,7 @@ import pytest
 from sim2real.artifacts.recording import Recording
 from sim2real.log import read_log
 from sim2real.stages.identify.stage import identify
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 
 DATASETS = Path(__file__).parents[2] / "datasets"
 MANIFEST = json.loads((DATASETS / "manifest.json").read_text())["logs"]
@@ -36,10 +36,10 @@ def test_the_log_is_complete(name):
 @pytest.mark.parametrize("name", MANIFEST)
 def test_identification_finds_the_true_parameters(name):
     entry = MANIFEST[name]
-    pipeline = load_pipeline(entry["pipeline"])
+    pipeline = load_robot(entry["pipeline"])
     recording = Recording.load(DATASETS / entry["pipeline"] / name)
     # Estimates are what is looked at; a third of the usual search finds where the descents begin.
-    config = replace(pipeline.identify, seed=1, folds=0, free_run_s=0.0, generations=25)
+    config = replace(pipeline.defaults.identify, seed=1, folds=0, free_run_s=0.0, generations=25)
     found = identify(pipeline, recording, config)
     rows = {p.name: p for p in found.parameters}
     for parameter, truth in entry["truth"].items():

@@ -10,9 +10,9 @@ from sim2real.errors import UsageError
 from sim2real.log import read_log
 from sim2real.robots.model.parameters import ParameterPattern
 from sim2real.robots.model.robot import RobotConfig
+from sim2real.stages.load import load_robot, mapping_of
 from sim2real.stages.pipeline.from_model import describe_robot, files_of
 from sim2real.stages.pipeline.open_log import open_recording
-from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.stages.pipeline.robot_flags import RobotFlags
 
 XML = """<mujoco>
@@ -51,7 +51,7 @@ def test_a_model_and_a_log_describe_a_robot(workplace):
     own = found.robot
     assert (own.joints, own.commands, own.step_s) == (("pan_joint", "lift_joint"), ("goal",), 0.002)
     assert own.rate_hz == pytest.approx(RATE_HZ, rel=1e-3)
-    names = [p.name for p in found.pipeline.load().dynamics()]
+    names = [p.name for p in found.made().dynamics()]
     assert names == ["kp", "damping", "armature", "frictionloss_pan_joint", "frictionloss_lift_joint"]
 
 
@@ -59,8 +59,8 @@ def test_a_later_log_is_read_by_the_mapping_of_the_pipeline(workplace, recorded)
     assert cli.main(NEW) == 0
     t, goal, q = recorded
     np.savez("still.npz", t_s=t, q_rad=0 * q, goal_rad=0 * goal)  # at rest, from which no mapping can be proposed
-    pipeline = load_pipeline("rig")
-    log = open_recording(Path("still.npz"), pipeline, pipeline.load())
+    pipeline = load_robot("rig")
+    log = open_recording(Path("still.npz"), pipeline)
     assert log.episode.outputs["sensor"]["position"].shape == q.shape
 
 
@@ -104,11 +104,10 @@ def test_new_writes_a_pipeline_that_loads(workplace, flags):
     assert {p.name for p in Path("pipelines/rig").iterdir()} == {
         "__init__.py", "robot.py", "robot.toml", "robot.xml", "import.toml"
     }  # fmt: skip
-    pipeline = load_pipeline("rig")
-    robot = pipeline.load()
+    robot = load_robot("rig")
     assert [c.label for c in robot.channels] == (list(flags[1:]) or ["pan_joint", "lift_joint"])
-    assert pipeline.identify.initial_state == "measured"
-    assert pipeline.mapping_of(Path("run.npz")) is not None
+    assert robot.defaults.identify.initial_state == "measured"
+    assert mapping_of(robot, Path("run.npz")) is not None
 
 
 def test_the_number_of_a_lone_joint_is_a_vector(workplace, recorded):
@@ -121,8 +120,8 @@ def test_the_number_of_a_lone_joint_is_a_vector(workplace, recorded):
     )
     flags = ["--joints", "pan_joint", "--hold", "lift_joint=0.1", "--mapping", "map.toml"]
     assert cli.main(["new", "rig", "--mjcf", "robot.xml", "--log", "lone.npz", *flags]) == 0
-    pipeline = load_pipeline("rig")
-    outputs = open_recording(Path("lone.npz"), pipeline, pipeline.load()).episode.outputs
+    pipeline = load_robot("rig")
+    outputs = open_recording(Path("lone.npz"), pipeline).episode.outputs
     shapes = {name: values.shape for fields in outputs.values() for name, values in fields.items()}
     assert shapes == {"goal": (1000, 1), "volts": (1000, 1), "position": (1000, 1)}
     # A log of ours keeps its shapes, and the error tells the remedy.

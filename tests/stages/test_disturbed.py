@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sim2real.errors import UsageError
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 from sim2real.stages.train.show import disturbance_rows
 from sim2real.stages.train.training_setup import prepare
 from sim2real.training.environment.variation import VariationConfig
@@ -15,10 +15,12 @@ from sim2real.training.environment.variation import VariationConfig
 @pytest.fixture(scope="module")
 def prepared():
     """Prepare a tiny training of the pendulum's nominal model."""
-    pipeline = load_pipeline("pendulum")
+    pipeline = load_robot("pendulum")
 
     def prepared(**vary):
-        config = replace(pipeline.train, model="nominal", timelines=1, episode_s=0.5, vary=VariationConfig(**vary))
+        config = replace(
+            pipeline.defaults.train, model="nominal", timelines=1, episode_s=0.5, vary=VariationConfig(**vary)
+        )
         return prepare(pipeline, config)
 
     return prepared

@@ -14,12 +14,12 @@ from sim2real.artifacts.identification import Estimate, Identification, Judgemen
 from sim2real.artifacts.posterior import Posterior
 from sim2real.commands.export import find_parameters
 from sim2real.identification.export import terms
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 
 
 def identified(pipeline, status="accepted", **values):
     """Return an identification of a pipeline, at its data sheet's values but for those that are given."""
-    table = load_pipeline(pipeline).load().identifiable(0.06).parameters
+    table = load_robot(pipeline).identifiable(0.06).parameters
     rows = []
     for p in table:
         value = values.get(p.name, p.nominal)

@@ -14,9 +14,9 @@ from sim2real.graph.node import BaseNode
 from sim2real.graph.schedule import draw
 from sim2real.robots.loop import control_nodes
 from sim2real.stages.deploy import simulation_gap, simulations
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 
-ARM = load_pipeline("arm").load()
+ARM = load_robot("arm")
 
 
 def steps(count, stamped=True):
@@ -98,7 +98,7 @@ class Push(Base):
 
 def test_simulated_measurements_are_compared_with_measurements():
     """A sensor's reading is as old as on the robot: like is compared with like."""
-    robot, late_s = load_pipeline("pendulum").load(), 0.03
+    robot, late_s = load_robot("pendulum"), 0.03
     values = robot.nominal() | {"sensor_delay": late_s, "actuator_delay": 0.01}
     episode = Episode(steps={n: steps(30) for n in ("sensor", "agent", "actuator")}, messages={}, outputs={})
     policy = Push(jnp.full(1, 1.5))

@@ -13,7 +13,7 @@ from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode, Steps
 from sim2real.stages.deploy import replay, verdict
 from sim2real.stages.deploy.next_command import with_command
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 
 FRICTION = Changed("friction", "rad/s^2", 6.0, 12.0, 11.0, 13.0, 0.9, 1e-20)
 STEADY = Drift((replace(FRICTION, now=6.1, explains=0.01, p=0.8),), 0.05, (), 20.0)
@@ -72,7 +72,7 @@ def test_an_episode_that_paused_is_no_evidence_against_the_model(folder):
     assert told.status == "not judged"
     assert told.reasons[0] == "episode 1 lost 0.41 s to pauses of its nodes, and no simulation has such pauses"
     assert "hinge in episode 1 is 0.2 rad or more beside all simulations" in told.reasons[1]
-    again = with_command(told, load_pipeline("pendulum"), IDENTIFIED, folder, found)
+    again = with_command(told, load_robot("pendulum"), IDENTIFIED, folder, found)
     assert again.next == "sim2real deploy pendulum --run runs/pendulum/T"
     slow = replace(deployed(took_s=0.004), replay=found.replay, courses=(off,))
     assert verdict.verdict(slow, BUNDLE).status == "re-train"
@@ -129,7 +129,7 @@ OWN = "--log runs/pendulum/T/deploy/episode_0.mcap --log runs/pendulum/T/deploy/
 )  # fmt: skip
 def test_the_command_can_be_typed(told, found, command, folder):
     """Where the robot has changed, recordings of before are left out."""
-    assert with_command(told, load_pipeline("pendulum"), IDENTIFIED, folder, deployed(**found)).next == command
+    assert with_command(told, load_robot("pendulum"), IDENTIFIED, folder, deployed(**found)).next == command
 
 
 LADEN = Drift((replace(FRICTION, name="payload", unit="kg", before=0.0, now=0.15),), 0.05, ("payload",), 20.0)
@@ -152,7 +152,7 @@ def test_what_an_arm_holds_is_identified_from_then_on(drift, terms, command, tmp
     (folder / "manifest.json").write_text('{"stage": "deploy"}')
     logs = tuple(Recording(folder.relative_to(tmp_path) / f"episode_{i}.mcap", episode()) for i in (0, 1))
     found = replace(deployed(drift=drift), recordings=logs)
-    told = with_command(Advice("re-identify", ()), load_pipeline("arm"), replace_terms(terms), folder, found)
+    told = with_command(Advice("re-identify", ()), load_robot("arm"), replace_terms(terms), folder, found)
     assert sorted(told.next.split()) == sorted(command.split())
 
 
@@ -162,7 +162,7 @@ def replace_terms(terms):
 
 
 def test_a_deployment_without_an_identification_says_so(folder):
-    told = verdict.judge(deployed(), load_pipeline("pendulum"), BUNDLE, None, folder).advice
+    told = verdict.judge(deployed(), load_robot("pendulum"), BUNDLE, None, folder).advice
     assert (told.status, told.next) == ("not judged", "sim2real identify pendulum --run runs/pendulum/T")
 
 
@@ -171,7 +171,7 @@ def test_a_policy_that_does_not_move_is_trained_again_though_its_model_cannot_be
         raise Sim2RealError("0.0 s of them in motion")
 
     monkeypatch.setattr(replay, "tested", too_little)
-    pipeline = load_pipeline("pendulum")
+    pipeline = load_robot("pendulum")
     told = verdict.judge(deployed(success=0.0), pipeline, BUNDLE, IDENTIFIED, folder).advice
     assert (told.status, told.next) == ("re-train", "sim2real train pendulum --run runs/pendulum/T")
     assert told.reasons == ("success is 0.00, in simulation 1.00", "0.0 s of them in motion")

@@ -11,7 +11,7 @@ from loop_stages import Stages
 from sim2real.artifacts.iterations import iterations
 from sim2real.artifacts.run import STAGES, attempts, finished, open_stage, stage_status
 from sim2real.errors import UsageError
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import defaults_of, load_robot
 
 
 def killed(stages, call, when, **options):
@@ -81,7 +81,7 @@ def test_a_killed_run_does_not_train_on_logs_that_do_not_suffice(tmp_path):
 def test_a_dry_deployment_is_refused_before_anything_moves(tmp_path):
     stages = Stages(tmp_path / "runs")
     with pytest.raises(UsageError, match="dry"):
-        stages.run(deploy=replace(load_pipeline("pendulum").deploy, dry_run=True))
+        stages.run(deploy=replace(defaults_of("pendulum").deploy, dry_run=True))
     assert stages.calls == []
 
 
@@ -108,7 +108,7 @@ def test_a_deployment_has_one_row_however_often_its_run_is_resumed(tmp_path):
 def test_what_was_made_from_an_older_stage_is_made_again(tmp_path, by_hand, follows, iterations):
     stages = Stages(tmp_path / "runs", ("fine",) * 3)
     run_dir = stages.run(iterations)
-    stages(by_hand, getattr(load_pipeline("pendulum"), by_hand), run_dir)
+    stages(by_hand, getattr(load_robot("pendulum").defaults, by_hand), run_dir)
     assert [stage for stage, s in stage_status(run_dir).items() if s.stale] == follows
     again = Stages(tmp_path / "runs", ("fine",) * 3)
     again.run(iterations, resume=run_dir)
@@ -125,24 +125,26 @@ def test_an_identification_of_other_logs_is_current_until_the_robot_is_recorded_
     stages = Stages(tmp_path / "runs", ("fine",))
     run_dir = stages.run(1)
     (run_dir / "outside.mcap").write_text("of another recorder")
-    usual = load_pipeline("pendulum")
-    stages("record", usual.record, run_dir)
-    stages("identify", replace(usual.identify, log=(str(run_dir / log),)), run_dir)
+    usual = load_robot("pendulum")
+    stages("record", usual.defaults.record, run_dir)
+    stages("identify", replace(usual.defaults.identify, log=(str(run_dir / log),)), run_dir)
     assert (not stage_status(run_dir)["identify"].stale) == current
-    stages("record", usual.record, run_dir)
+    stages("record", usual.defaults.record, run_dir)
     assert stage_status(run_dir)["identify"].stale
 
 
 def test_a_policy_of_the_nominal_model_and_a_run_without_a_recording_are_not_stale(tmp_path):
-    stages, usual = Stages(tmp_path / "runs", ("fine",)), load_pipeline("pendulum")
+    stages, usual = Stages(tmp_path / "runs", ("fine",)), load_robot("pendulum")
     run_dir = stages.run(1)
-    stages("identify", usual.identify, run_dir)
-    with open_stage(stages.root, "pendulum", "train", replace(usual.train, model="nominal"), {}, run_dir) as opened:
+    stages("identify", usual.defaults.identify, run_dir)
+    with open_stage(
+        stages.root, "pendulum", "train", replace(usual.defaults.train, model="nominal"), {}, run_dir
+    ) as opened:
         opened.output("bundle", "bundle").mkdir()
     assert not stage_status(run_dir)["train"].stale
     assert stage_status(run_dir)["deploy"].stale
     (tmp_path / "log").write_text("log")
     alone = Stages(tmp_path / "alone")
-    done = alone("identify", replace(usual.identify, log=(str(tmp_path / "log"),)), None)
+    done = alone("identify", replace(usual.defaults.identify, log=(str(tmp_path / "log"),)), None)
     assert [s.stale for s in stage_status(done.run_dir).values()] == [""]
     assert finished(done.run_dir, "record") is None

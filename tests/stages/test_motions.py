@@ -11,10 +11,10 @@ from sim2real.artifacts.run import newest
 from sim2real.errors import UsageError
 from sim2real.log.reader import read_log
 from sim2real.stages.excitation.played import played
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_module, load_robot
 
-ARM = load_pipeline("so101")
-SERVOS = ARM.load().drive.servos
+ARM = load_robot("so101")
+SERVOS = ARM.drive.servos
 LOW, HIGH = np.array(SERVOS.low), np.array(SERVOS.high)
 T_S = np.arange(0.0, 4.0, 1 / 30)
 
@@ -35,9 +35,9 @@ def write(path, pose, order=range(6), unit="deg"):
 
 
 def goals(path, **settings):
-    config = replace(ARM.record, excitation=str(path), **settings)
-    robot = ARM.load()
-    return robot.drive.around(played(config, ARM, robot, announce=True))
+    config = replace(ARM.defaults.record, excitation=str(path), **settings)
+    robot = ARM
+    return robot.drive.around(played(config, robot, announce=True))
 
 
 def at_the_robots_rate(pose):
@@ -113,7 +113,7 @@ def test_a_motion_that_leaves_the_limits_or_is_too_fast_is_refused_by_joint_and_
     with pytest.raises(UsageError, match=r"outside of the limits everywhere: .* must lie in"):
         goals(write(tmp_path / "motion.csv", wave() + 3.0))
     with pytest.raises(UsageError, match=r"shoulder_lift is -1.6. rad at 2.9. s, and must lie in \[-1.5, -0.3\]"):
-        goals(write(tmp_path / "motion.csv", wave(0.95)), gate=replace(ARM.record.gate, limit=1.5))
+        goals(write(tmp_path / "motion.csv", wave(0.95)), gate=replace(ARM.defaults.record.gate, limit=1.5))
 
 
 def test_files_without_a_motion_are_refused(tmp_path):
@@ -125,7 +125,7 @@ def test_files_without_a_motion_are_refused(tmp_path):
     with pytest.raises(UsageError, match="shorter than 1 s"):
         goals(write(tmp_path / "short.csv", wave()[:20]))
     with pytest.raises(UsageError, match="neither multisine, chirp, steps, hand nor standing, nor a file"):
-        replace(ARM.record, excitation="wobble")
+        replace(ARM.defaults.record, excitation="wobble")
 
 
 @pytest.mark.night  # an arm plays one below
@@ -149,7 +149,7 @@ def test_a_log_is_a_motion_that_the_arm_reaches_slowly(tmp_path, virtual_robots)
     assert cli.main(["record", "so101", "--excitation", str(path), "--dry-run", "--runs", str(tmp_path)]) == 0
     (folder,) = tmp_path.glob("so101/*/record")
     planned = read_log(folder / "session.mcap").outputs["agent"]["goal"]
-    start = np.array(ARM.load("plant").SO101Plant().data.qpos)
+    start = np.array(load_module(ARM.name, "plant").SO101Plant().data.qpos)
     np.testing.assert_allclose(planned[0], start, atol=0.02)
     assert np.abs(np.diff(planned, axis=0)).max() * 50 < 8.0
     settled = int(np.ceil(np.abs(start - rows[0]).max() * 50)) + 1

@@ -17,8 +17,8 @@ from sim2real.hardware.device import OperatingMode
 from sim2real.log.reader import read_log
 from sim2real.robots.nodes import Excitation
 from sim2real.stages.excitation.played import played
+from sim2real.stages.load import load_module, load_robot
 from sim2real.stages.on_robot import come_to_rest
-from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.view.delay_parts import parts_of
 
 
@@ -79,7 +79,7 @@ def test_a_dry_run_sends_nothing_that_moves_and_is_no_recording(tmp_path, virtua
 
 
 def test_a_robot_that_leans_too_far_is_stopped(tmp_path, virtual_robots, monkeypatch):
-    agent = type(load_pipeline("pendulum").load().agent)
+    agent = type(load_robot("pendulum").agent)
     from_hanging = lambda observation: float(np.arctan2(abs(observation[1]), -observation[0]))  # noqa: E731
     monkeypatch.setattr(agent, "tilt_rad", staticmethod(from_hanging), raising=False)
     bundle = make_bundle("pendulum", tmp_path, 0.6, slope=40.0)  # it pumps
@@ -143,16 +143,15 @@ def test_a_recording_knows_the_shares_of_host_and_bus_in_the_delay(tmp_path, vir
 
 
 def test_a_recording_by_hand_has_no_command_and_no_torque(tmp_path, virtual_robots):
-    pipeline = load_pipeline("so101")
-    robot = pipeline.load()
+    robot = load_robot("so101")
     embedded = robot.drive.embedded
-    start, t_s = np.array(pipeline.load("plant").SO101Plant().data.qpos), np.arange(0.0, 4.0, 1 / 30)
+    start, t_s = np.array(load_module(robot.name, "plant").SO101Plant().data.qpos), np.arange(0.0, 4.0, 1 / 30)
     middle = (np.array(robot.drive.servos.low) + np.array(robot.drive.servos.high)) / 2
     pose = np.vstack([start, middle + 0.3 * np.sin(2 * np.pi * 0.2 * t_s[:, None] + np.arange(6))])
     np.savez(tmp_path / "hand.npz", t_s=np.concatenate([[0.0], 2.0 + t_s]), position=pose)
     changed = replace(embedded, plant_args={**embedded.plant_args, "hand": str(tmp_path / "hand.npz")})
     arm = type(robot)()
-    settings = pipeline.load("robot").calibrated
+    settings = load_module(robot.name, "robot").calibrated
     arm.drive = type(robot.drive)(robot.drive.servos, embedded=lambda: changed, settings=settings)
     recording = sim2real.record(arm, tmp_path / "log", {"excitation": "hand", "duration_s": 6.0})
     assert set(recording.episode.steps) == {"sensor"}
@@ -162,8 +161,8 @@ def test_a_recording_by_hand_has_no_command_and_no_torque(tmp_path, virtual_robo
     assert set(modes.astype(int)) <= {int(OperatingMode.OFF)}, "the gate sent nothing"
     assert recording.episode.metadata["dry_run"] is True
     with pytest.raises(errors.Sim2RealError, match="guided by hand") as caught:
-        sim2real.identify(replace(pipeline, name=recording.pipeline), recording)
+        sim2real.identify(arm, recording)
     assert "--excitation LOG" in caught.value.hint
     # As the hint says, its positions are a motion to play.
-    motion = played(replace(pipeline.record, excitation=str(recording.path)), pipeline, robot, announce=False)
+    motion = played(replace(robot.defaults.record, excitation=str(recording.path)), robot, announce=False)
     assert len(motion) > 150

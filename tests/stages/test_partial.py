@@ -18,8 +18,8 @@ from sim2real.errors import Sim2RealError
 from sim2real.stages.identify import fitting
 from sim2real.stages.identify import stage as identify_stage
 from sim2real.stages.identify.progress import Best, kept
+from sim2real.stages.load import load_robot
 from sim2real.stages.pipeline.open_parameters import open_identification
-from sim2real.stages.pipeline.pipeline import load_pipeline
 
 ROOT = Path(__file__).parents[2]
 LOG = ROOT / "datasets" / "pendulum" / "chirp.mcap"
@@ -27,7 +27,7 @@ LOG = ROOT / "datasets" / "pendulum" / "chirp.mcap"
 
 @pytest.fixture
 def pendulum():
-    return load_pipeline("pendulum")
+    return load_robot("pendulum")
 
 
 def interrupted(pipeline, root, monkeypatch, ending, told=True):
@@ -42,7 +42,7 @@ def interrupted(pipeline, root, monkeypatch, ending, told=True):
         raise ending
 
     monkeypatch.setattr(fitting, "fitted_to", fit)
-    config = replace(pipeline.identify, log=(str(LOG),))
+    config = replace(pipeline.defaults.identify, log=(str(LOG),))
     with pytest.raises(type(ending)):
         identify_stage.run(pipeline, config, root, None)
     (run,) = (root / "pendulum").iterdir()
@@ -90,7 +90,7 @@ def fitted(monkeypatch, before_judging, judged):
 def test_an_error_in_the_judgement_leaves_the_fit(pendulum, tmp_path, monkeypatch, capsys):
     fitted(monkeypatch, lambda: None, lambda *inputs: 1 // 0)
     with pytest.raises(ZeroDivisionError):
-        identify_stage.run(pendulum, replace(pendulum.identify, log=(str(LOG),)), tmp_path, None)
+        identify_stage.run(pendulum, replace(pendulum.defaults.identify, log=(str(LOG),)), tmp_path, None)
     (run,) = (tmp_path / "pendulum").iterdir()
     stage = attempts(run, "identify")[0]
     assert stage.manifest.status == "failed"

@@ -3,8 +3,8 @@
 import pytest
 
 from sim2real.errors import UsageError
-from sim2real.stages.config import IdentifyConfig
-from sim2real.stages.pipeline.pipeline import available, load_pipeline, pipeline_of
+from sim2real.stages.config import Defaults
+from sim2real.stages.load import available, defaults_of, folder_of, load_module, load_robot, robot_of, summary_of
 
 ROBOT = """
 from sim2real.robots.robot import RecordedRobot
@@ -17,13 +17,13 @@ class Robot(RecordedRobot):
 
 ROBOT = Robot()
 """
-INIT = "from sim2real.stages.pipeline.pipeline import Pipeline\nPIPELINE = Pipeline({name!r}, {about!r}, __name__)\n"
+INIT = '"""The {about}."""\n'
 
 
-def write(folder, name, about="robot", calls_itself=None, text=None, robot=None):
+def write(folder, name, about="robot", text=None, robot=None):
     target = folder / "pipelines" / name
     target.mkdir(parents=True)
-    (target / "__init__.py").write_text(text or INIT.format(name=calls_itself or name, about=about))
+    (target / "__init__.py").write_text(text or INIT.format(about=about))
     (target / "robot.py").write_text(robot or ROBOT.format(about=about))
 
 
@@ -32,15 +32,16 @@ def test_a_folder_beside_the_user_is_a_pipeline(tmp_path, monkeypatch):
     assert "found_here" not in available()
     monkeypatch.chdir(tmp_path)
     assert {"found_here", "pendulum"} <= set(available())
-    assert load_pipeline("found_here").load().units == {"about": "robot"}
-    assert load_pipeline("found_here") is load_pipeline("found_here")
+    assert load_robot("found_here").units == {"about": "robot"}
+    assert load_robot("found_here") is load_robot("found_here")
 
 
 def test_the_robot_is_an_object_of_its_module(tmp_path, monkeypatch):
     write(tmp_path, "one_object")
     monkeypatch.chdir(tmp_path)
-    pipeline = load_pipeline("one_object")
-    assert pipeline.load() is pipeline.load("robot").ROBOT
+    robot = load_robot("one_object")
+    assert robot is load_module("one_object", "robot").ROBOT
+    assert (robot.name, robot.folder) == ("one_object", tmp_path / "pipelines" / "one_object")
 
 
 @pytest.mark.parametrize(
@@ -56,7 +57,7 @@ def test_a_module_without_a_robot_says_how_to_write_one(tmp_path, monkeypatch, t
     write(tmp_path, name, robot=text)
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UsageError, match=f"ROBOT of pipeline .*{said}.*sim2real.robots.robot.Robot") as caught:
-        load_pipeline(name).load()
+        load_robot(name)
     assert "end with `ROBOT = MyRobot()`" in (caught.value.hint or "")
 
 
@@ -65,9 +66,8 @@ def test_folders_of_one_name_are_told_apart(tmp_path, monkeypatch):
         write(tmp_path / where, "same_name", about=where)
     for where in ("one", "two", "one"):
         monkeypatch.chdir(tmp_path / where)
-        pipeline = load_pipeline("same_name")
-        assert pipeline.summary == where
-        assert pipeline.load().units == {"about": where}
+        assert load_robot("same_name").units == {"about": where}
+        assert summary_of("same_name") == f"The {where}"
 
 
 def test_a_pipeline_that_cannot_be_imported_fails_every_time(tmp_path, monkeypatch):
@@ -75,38 +75,43 @@ def test_a_pipeline_that_cannot_be_imported_fails_every_time(tmp_path, monkeypat
     monkeypatch.chdir(tmp_path)
     for _ in range(2):
         with pytest.raises(ModuleNotFoundError, match="no_such_module_anywhere"):
-            load_pipeline("broken_import")
+            load_robot("broken_import")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"text": "x = 1\n"}, "defines no PIPELINE"),
-        ({"calls_itself": "pendulum"}, "calls itself 'pendulum'"),
-    ],
-)
-def test_pipelines_that_are_none(tmp_path, monkeypatch, arguments, message):
-    name = f"odd_{len(message)}"
-    write(tmp_path, name, **arguments)
+def test_a_single_module_is_a_pipeline(tmp_path, monkeypatch):
+    folder = tmp_path / "pipelines" / "single"
+    folder.mkdir(parents=True)
+    text = '"""A robot in one file."""\nfrom sim2real.stages.config import Defaults, RecordConfig\n'
+    (folder / "robot.py").write_text(text + "DEFAULTS = Defaults(RecordConfig(seed=3))\n" + ROBOT.format(about=""))
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(UsageError, match=message):
-        load_pipeline(name)
+    assert "single" in available()
+    assert (summary_of("single"), folder_of("single")) == ("A robot in one file", folder)
+    assert load_robot("single").defaults.record.seed == 3
 
 
-def test_a_robot_stands_for_the_pipeline_that_has_loaded_it():
-    disk = load_pipeline("disk")
-    assert pipeline_of(disk) is disk
-    assert pipeline_of(disk.load()) is disk
-    assert pipeline_of("disk").name == "disk"
+def test_defaults_of_another_type_are_refused(tmp_path, monkeypatch):
+    write(tmp_path, "odd_defaults", text="DEFAULTS = 1\n")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UsageError, match="DEFAULTS"):
+        load_robot("odd_defaults")
+
+
+def test_the_robot_of_another_pipeline_keeps_its_own_name(tmp_path, monkeypatch):
+    borrowed = "from sim2real.stages.load import load_robot\nROBOT = load_robot('disk')\n"
+    write(tmp_path, "borrowed", robot=borrowed)
+    monkeypatch.chdir(tmp_path)
+    assert [load_robot(name).name for name in ("disk", "borrowed", "disk")] == ["disk", "borrowed", "disk"]
+    assert defaults_of("borrowed") == Defaults() != defaults_of("disk")
 
 
 def test_a_robot_of_ones_own_goes_by_the_name_of_its_class():
-    own = type("Spare", (type(load_pipeline("disk").load()),), {})()
-    found = pipeline_of(own)
-    assert (found.name, found.load(), found.identify) == ("Spare", own, IdentifyConfig())
+    disk = load_robot("disk")
+    assert robot_of(disk) is robot_of("disk") is disk
+    own = robot_of(type("Spare", (type(disk),), {})())
+    assert (own.name, own.folder, defaults_of(own)) == ("Spare", None, Defaults())
 
 
 @pytest.mark.parametrize("robot", [None, 3])
 def test_what_is_no_robot_is_refused(robot):
-    with pytest.raises(UsageError, match=rf"{robot!r} is neither a robot nor a pipeline(.|\n)*load_pipeline\(NAME\)"):
-        pipeline_of(robot)
+    with pytest.raises(UsageError, match=rf"{robot!r} is no robot"):
+        robot_of(robot)

@@ -8,8 +8,8 @@ import pytest
 from sim2real.artifacts.recording import Recording
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode
+from sim2real.stages.load import load_robot
 from sim2real.stages.pipeline.open_log import open_recording, require_units
-from sim2real.stages.pipeline.pipeline import load_pipeline
 
 DATASET = Path(__file__).parents[2] / "datasets" / "pendulum" / "steps.mcap"
 
@@ -20,14 +20,14 @@ def recording(units, metadata=None):
 
 @pytest.fixture(scope="module")
 def pendulum():
-    return load_pipeline("pendulum")
+    return load_robot("pendulum")
 
 
 def test_units_come_from_the_channels_and_of_older_logs_from_the_session(pendulum):
     assert recording({"sensor": {"th": "rad"}, "actuator": {"action": "V"}}).units == {"th": "rad", "action": "V"}
     assert recording({"a": {"x": "m", "y": "s"}, "b": {"x": "mm"}}).units == {"y": "s"}
     assert recording({}, {"units": {"th": "rad"}}).units == {"th": "rad"}
-    old = open_recording(DATASET, pendulum, pendulum.load())  # of a session before anything had units
+    old = open_recording(DATASET, pendulum)  # of a session before anything had units
     assert not old.units
     assert np.isfinite(old.episode.outputs["sensor"]["th"]).all()
 
@@ -42,8 +42,8 @@ def test_units_come_from_the_channels_and_of_older_logs_from_the_session(pendulu
 )
 def test_a_log_in_other_units_is_refused(pendulum, units, metadata, said):
     with pytest.raises(Sim2RealError, match=f"{said}(.|\n)*scale"):
-        require_units(recording(units, metadata), pendulum.load())
+        require_units(recording(units, metadata), pendulum)
 
 
 def test_what_neither_knows_is_let_through(pendulum):
-    require_units(recording({"sensor": {"th": "rad", "temperature": "K"}, "camera": {"th": "px"}}), pendulum.load())
+    require_units(recording({"sensor": {"th": "rad", "temperature": "K"}, "camera": {"th": "px"}}), pendulum)

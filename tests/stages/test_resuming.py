@@ -11,7 +11,7 @@ from sim2real import cli
 from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.run import open_stage
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import defaults_of
 from sim2real.stages.train import resume, stage
 from sim2real.stages.train.resume import CHECKPOINT, find_interrupted
 
@@ -65,11 +65,11 @@ def test_the_policy_of_a_resumed_training_is_the_uninterrupted_ones(runs, tmp_pa
 
 def settings(own, target, **changes):
     from sim2real.commands import flags
-    from sim2real.stages.pipeline.pipeline import load_pipeline
+    from sim2real.stages.load import defaults_of
 
     words = [*TINY[2:], "--resume", str(target)]
     words += [word for name, value in changes.items() for word in (f"--{name}", value)]
-    config = load_pipeline("pendulum").train
+    config = defaults_of("pendulum").train
     return flags.parse(config, words, "", "")
 
 
@@ -98,7 +98,7 @@ def test_what_cannot_be_swept_is_refused_at_once(capsys):
 
 
 def test_a_training_that_still_runs_is_not_gone_on_with(tmp_path):
-    config = load_pipeline("pendulum").train
+    config = defaults_of("pendulum").train
     said = r"is still running[\s\S]*hint: wait until it has ended"
     with open_stage(tmp_path, "pendulum", "train", config) as opened, pytest.raises(UsageError, match=said):
         find_interrupted("pendulum", replace(config, resume=str(opened.folder)), tmp_path)

@@ -9,7 +9,7 @@ from sim2real.artifacts.iterations import iterations
 from sim2real.artifacts.run import STAGES
 from sim2real.commands.run import RunFlags
 from sim2real.errors import DelayChanged, UsageError
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import defaults_of
 from sim2real.view.sections import iterations_sections
 
 
@@ -99,7 +99,7 @@ def test_an_estimate_that_stays_at_a_bound_leads_to_a_recording_and_then_to_an_e
     ],
 )
 def test_a_policy_that_fails_in_simulation_is_trained_once_more_for_longer(world, successes, options, again):
-    world.successes, ppo = [1.0, *successes], replace(load_pipeline("pendulum").train.ppo, **options)
+    world.successes, ppo = [1.0, *successes], replace(defaults_of("pendulum").train.ppo, **options)
     done, _ = world.go(verdict("re-train", 0.6), verdict("fine", 1.0), train={"ppo": ppo})
     assert done == again
     steps = [config.ppo.total_steps for stage, config in world.calls if stage == "train"]

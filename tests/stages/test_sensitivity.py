@@ -15,7 +15,7 @@ from sim2real.artifacts.sensitivity import Moved, Sensitivity
 from sim2real.errors import Sim2RealError
 from sim2real.graph.schedule import draw
 from sim2real.runtime.compiled.graph import CompiledGraph
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 from sim2real.stages.train.sensitivity import models_of, moves_of, sensitivity, with_room
 from sim2real.training.environment.graph_environment import GraphEnvironment
 from sim2real.training.networks.architectures import MLP
@@ -50,7 +50,7 @@ def found_with(errors, names=tuple(n for n in VALUES if n != "sensor_delay")):
 SURE = dict.fromkeys(VALUES, 1e-3) | {"sensor_delay": 1e-3, "actuator_delay": 1e-3}
 
 
-class Holding(type(load_pipeline("pendulum").load().task)):
+class Holding(type(load_robot("pendulum").task)):
     """Succeeds near the angle; all episodes start hanging at rest."""
 
     def random(self, key, draw):
@@ -61,7 +61,7 @@ class Holding(type(load_pipeline("pendulum").load().task)):
 
 
 def holding():
-    robot = type(load_pipeline("pendulum").load())()
+    robot = type(load_robot("pendulum"))()
     robot.task = Holding()
     return robot
 

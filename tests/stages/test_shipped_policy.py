@@ -8,7 +8,7 @@ import pytest
 from sim2real.commands.loop import run_all, why_shipped
 from sim2real.commands.run import RunFlags
 from sim2real.errors import UsageError
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import defaults_of, load_robot
 
 
 @pytest.fixture
@@ -16,13 +16,13 @@ def go(tmp_path):
     """Return the stages that a run of the Go2 calls, with their configurations."""
 
     def run(**flags):
-        pipeline, called = load_pipeline("go2"), {}
+        pipeline, called = load_robot("go2"), {}
 
         def call(stage, config, run_dir):
             called[stage] = config
             return SimpleNamespace(run_dir=tmp_path if run_dir is None else run_dir)
 
-        run_all(pipeline, RunFlags(runs=tmp_path, **pipeline.in_a_run, **flags), call)
+        run_all(pipeline, RunFlags(runs=tmp_path, **pipeline.defaults.in_a_run, **flags), call)
         return called
 
     return run
@@ -40,8 +40,8 @@ def test_with_a_gpu_a_policy_is_trained_on_the_identification(go, monkeypatch):
     called = go()
     assert list(called) == ["record", "identify", "train", "deploy"]
     assert called["train"].model == "identified"
-    assert load_pipeline("go2").train.model == "nominal"
+    assert defaults_of("go2").train.model == "nominal"
 
 
 def test_a_robot_that_a_processor_trains_is_trained():
-    assert why_shipped(load_pipeline("pendulum")) == ""
+    assert why_shipped(load_robot("pendulum")) == ""

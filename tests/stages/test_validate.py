@@ -17,8 +17,8 @@ from sim2real.artifacts.identification import (
 )
 from sim2real.artifacts.recording import Recording
 from sim2real.errors import UsageError
+from sim2real.stages.load import load_robot
 from sim2real.stages.pipeline.open_log import open_recording
-from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.stages.shared.identification import identified_robot
 from sim2real.stages.validate import stage
 from sim2real.stages.validate.config import ValidateConfig
@@ -53,7 +53,7 @@ def test_an_error_above_the_expected_one_is_named_and_fails(rows, changes, holds
     assert found.holds == holds
     assert named in found.verdict
     monkeypatch.setattr(stage.Identification, "load", lambda path: Identification("arm", (), Judgement("", ()), ()))
-    monkeypatch.setattr(stage, "load_pipeline", lambda name: load_pipeline("arm"))
+    monkeypatch.setattr(stage, "load_robot", lambda name: load_robot("arm"))
     monkeypatch.setattr(stage, "open_recording", lambda *given: None)
     monkeypatch.setattr(stage, "score", lambda *given: found)
     for as_json in (False, True):
@@ -71,11 +71,11 @@ def test_an_error_above_the_expected_one_is_named_and_fails(rows, changes, holds
 
 def identification(upper_s=0.06, world=None, expected=1.0, horizon_s=1.0):
     """The pendulum at the values of its data sheet, with an expected error of its angle."""
-    pipeline = load_pipeline("pendulum")
+    pipeline = load_robot("pendulum")
     parameters = tuple(
         Estimate(p.name, p.unit, p.kind, "", p.nominal, p.nominal, "accepted", lower=p.low,
                  upper=2 * upper_s if p.name == "actuator_delay" else p.high)
-        for p in pipeline.load().identifiable(0.06).parameters
+        for p in pipeline.identifiable(0.06).parameters
     )  # fmt: skip
     error = (ExpectedError("th", "th", "rad", AHEAD, horizon_s, expected),)
     return pipeline, Identification(
@@ -86,7 +86,7 @@ def identification(upper_s=0.06, world=None, expected=1.0, horizon_s=1.0):
 def test_an_identification_is_scored_in_its_world_and_with_its_delays():
     pipeline, found = identification(upper_s=0.2)
     assert identified_robot(found, pipeline)[1].max_delay_s == 0.2
-    assert identified_robot(identification()[1], pipeline)[1].max_delay_s == pipeline.identify.max_delay_s
+    assert identified_robot(identification()[1], pipeline)[1].max_delay_s == pipeline.defaults.identify.max_delay_s
     with pytest.raises(UsageError, match="nowhere"):
         identified_robot(identification(world="nowhere")[1], pipeline)
 

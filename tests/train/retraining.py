@@ -14,7 +14,7 @@ from sim2real.artifacts.identification import Noise
 from sim2real.graph.delays import EmpiricalDist
 from sim2real.graph.schedule import draw
 from sim2real.runtime.compiled.graph import CompiledGraph
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 from sim2real.training.config import PPOConfig
 from sim2real.training.environment.graph_environment import GraphEnvironment
 from sim2real.training.ppo.trainer import train
@@ -22,7 +22,7 @@ from sim2real.training.ppo.trainer import train
 
 def environment(recording: int) -> GraphEnvironment:
     """Return the environment after recording 0 or 1."""
-    robot: Any = load_pipeline("pendulum").load()
+    robot: Any = load_robot("pendulum")
     rng = np.random.default_rng(recording)
     values = {n: v * (1 + 0.02 * recording) for n, v in robot.nominal().items()}
     values |= {"sensor_delay": 0.020 + 0.0007 * recording, "actuator_delay": 0.024 - 0.0003 * recording}

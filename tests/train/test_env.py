@@ -10,7 +10,7 @@ from sim2real.errors import UsageError
 from sim2real.graph.schedule import draw
 from sim2real.robots.loop import AGENT
 from sim2real.runtime.compiled.graph import CompiledGraph
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 from sim2real.training.environment.graph_environment import GraphEnvironment
 from sim2real.training.environment.tasks import checked_end, terms_of, total_of
 from sim2real.training.ppo.losses import gae
@@ -23,7 +23,7 @@ COPIES = 16
 
 @pytest.fixture(scope="module")
 def robot():
-    robot = type(load_pipeline("pendulum").load())()
+    robot = type(load_robot("pendulum"))()
 
     class Careful(type(robot.task)):
         def terminated(self, state):
@@ -116,5 +116,5 @@ def test_an_end_that_is_no_bool_is_refused(ended):
 
 
 def test_a_robot_that_says_nothing_never_ends_an_episode():
-    robot = load_pipeline("pendulum").load()
+    robot = load_robot("pendulum")
     assert not robot.task.terminated(None)

@@ -14,7 +14,7 @@ from sim2real.graph.node import BaseNode
 from sim2real.graph.schedule import draw
 from sim2real.robots.loop import AGENT
 from sim2real.runtime.compiled.graph import CompiledGraph
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 from sim2real.stages.train.show import training_summary
 from sim2real.training.config import PPOConfig
 from sim2real.training.environment.graph_environment import GraphEnvironment
@@ -32,7 +32,7 @@ CONFIG = PPOConfig(
 
 @pytest.fixture(scope="module")
 def robot():
-    return load_pipeline("pendulum").load()
+    return load_robot("pendulum")
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,8 @@ import synthetic_run
 from sim2real.artifacts.run import finished_stages
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import StepRecord, steps_from_records
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.live.scene import drawn, scene_of
+from sim2real.stages.load import load_robot
 from sim2real.view.rerun_content import states_of, tabs_of
 from sim2real.view.rerun_recording import _COLORS, view
 
@@ -48,7 +49,7 @@ def rerun(*arguments: str | Path, **environment: str) -> str:
 def saved(finished_run, tmp_path_factory):
     pytest.importorskip("rerun")
     path = tmp_path_factory.mktemp("rerun") / "run.rrd"
-    view(finished_run, path, load_pipeline("pendulum").load("scene").log_scene)
+    view(finished_run, path, drawn(scene_of(load_robot("pendulum"))))
     return path
 
 
@@ -65,9 +66,9 @@ def test_every_curve_stands_on_the_one_timeline(saved, finished_run):
     for folder in ("record", "deploy/0", "deploy/1"):
         assert rows[f"/{folder}/lateness/agent"] == synthetic_run.STEPS
         assert rows[f"/{folder}/schedule/agent"] >= 3 * synthetic_run.STEPS
-        assert rows[f"/{folder}/scene/robot/turning"] == synthetic_run.STEPS
-    assert rows["/deploy/0/scene/simulation/turning"] == 400
-    assert rows["/identify/scene/identified/turning"] == 250
+        assert rows[f"/{folder}/scene/robot/body_1"] == synthetic_run.STEPS
+    assert rows["/deploy/0/scene/simulation/body_1"] == 400
+    assert rows["/identify/scene/identified/body_1"] == 250
 
 
 def rows_by_entity(path: Path) -> Counter[str]:
@@ -125,7 +126,7 @@ def test_the_pendulum_points_where_the_angle_says(saved):
     from rerun.chunk import RrdReader
 
     chunks = RrdReader(saved).stream().to_chunks()
-    turns = next(c for c in chunks if c.entity_path == "/record/scene/robot/turning" and not c.is_static)
+    turns = next(c for c in chunks if c.entity_path == "/record/scene/robot/body_1" and not c.is_static)
     batch = turns.to_record_batch()
     column = next(c for c in batch.schema.names if "quaternion" in c)
     x, y, z, w = np.array([q[0] for q in batch.column(column).to_pylist()]).T

@@ -38,10 +38,10 @@ def record(
     from sim2real.hardware.registry import load_named
     from sim2real.robots.servo.drive import approached
     from sim2real.stages.excitation.signals import excitation
-    from sim2real.stages.pipeline.pipeline import load_pipeline
+    from sim2real.stages.load import load_robot
 
-    pipeline = load_pipeline("go2")
-    robot: Any = pipeline.load()
+    pipeline = load_robot("go2")
+    robot: Any = pipeline
     plant = load_named(f"{Path(robot.mjcf).with_name('plant.py')}:Go2Body", "plant")
     drawn = load_named(f"{Path(robot.mjcf).with_name('plant.py')}:latencies", "plant")
     sensing_s, acting_s, jitter_s = latencies_s or drawn(seed)
@@ -55,7 +55,7 @@ def record(
     else:
         begin_ns = round(1e9 * HANG_S)
         legs.advance(begin_ns)
-        config_of = replace(pipeline.record, duration_s=seconds, seed=seed)
+        config_of = replace(pipeline.defaults.record, duration_s=seconds, seed=seed)
         hanging = legs.state(begin_ns).record["motor_state"]["q"][:12]
         signal = excitation(config_of, robot.rate_hz, len(robot.joints))
         goals = approached(robot.drive.around(signal), hanging, robot.rate_hz)

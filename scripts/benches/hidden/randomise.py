@@ -96,14 +96,14 @@ def one_robot(number: int, options: argparse.Namespace) -> dict[str, Any]:
     """Return the results of one robot."""
     import sim2real
     from sim2real.errors import Sim2RealError
-    from sim2real.stages.pipeline.pipeline import load_pipeline
+    from sim2real.stages.load import load_robot
 
     wear = hidden.Wear(**{f.name: getattr(options, f.name) for f in fields(hidden.Wear)})
-    robot, pipeline = hidden.Hidden.draw(number, wear), load_pipeline("pendulum")
+    robot, pipeline = hidden.Hidden.draw(number, wear), load_robot("pendulum")
     ways: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as folder:
         recording = recorded(robot, pipeline, options, Path(folder) / "record")
-        config = replace(pipeline.identify, folds=0, generations=options.generations, seed=number)
+        config = replace(pipeline.defaults.identify, folds=0, generations=options.generations, seed=number)
         identified = sim2real.identify(pipeline, recording, config)
         for way in options.ways:
             begin = time.perf_counter()
@@ -170,10 +170,10 @@ def train_config(pipeline: Any, way: str, seed: int, options: argparse.Namespace
     """Return the training's configuration for one of ``WAYS``."""
     settings = dict(WAYS[way])
     top = {n: settings.pop(n) for n in ("model", "randomise") if n in settings}
-    few = {"minibatches": 2, "evaluations": 1} if options.envs < pipeline.train.ppo.minibatches else {}
-    ppo = replace(pipeline.train.ppo, total_steps=options.steps, num_envs=options.envs, **few)
-    vary = replace(pipeline.train.vary, **settings)
-    return replace(pipeline.train, seed=seed, force=True, vary=vary, ppo=ppo, **top)
+    few = {"minibatches": 2, "evaluations": 1} if options.envs < pipeline.defaults.train.ppo.minibatches else {}
+    ppo = replace(pipeline.defaults.train.ppo, total_steps=options.steps, num_envs=options.envs, **few)
+    vary = replace(pipeline.defaults.train.vary, **settings)
+    return replace(pipeline.defaults.train, seed=seed, force=True, vary=vary, ppo=ppo, **top)
 
 
 def controller(bundle: Any, volts: float) -> Callable[[float, float], float]:
@@ -207,7 +207,7 @@ def put_on_the_bus(robot: hidden.Hidden, pipeline: Any) -> None:
 
     The computer's own pauses are those of this machine: ``hiccups`` are not played.
     """
-    pipeline_robot = pipeline.load()
+    pipeline_robot = pipeline
     jitter = math.sqrt(3.0) * robot.jitter
     emulator = replace(
         pipeline_robot.drive.embedded.emulator,
@@ -236,7 +236,7 @@ def record_on_the_bus(pipeline: Any, folder: Path, seconds: float, volts: float,
     import sim2real
 
     folder.mkdir()
-    config = replace(pipeline.record, duration_s=seconds, amplitude=volts, seed=seed)
+    config = replace(pipeline.defaults.record, duration_s=seconds, amplitude=volts, seed=seed)
     return sim2real.record(pipeline, folder, config)
 
 
@@ -247,7 +247,7 @@ def deploy_on_the_bus(
     import sim2real
 
     folder.mkdir()
-    config = replace(pipeline.deploy, duration_s=seconds, episodes=trials, measure_delay=False)
+    config = replace(pipeline.defaults.deploy, duration_s=seconds, episodes=trials, measure_delay=False)
     deployment = sim2real.deploy(pipeline, bundle, folder, config)
     motions = []
     for recording in deployment.recordings:

@@ -23,9 +23,9 @@ from sim2real.identification.problem import Problem
 from sim2real.identification.segments import Span
 from sim2real.stages.config import IdentifyConfig
 from sim2real.stages.identify import fitting
+from sim2real.stages.load import load_robot
 from sim2real.stages.pipeline import from_model
 from sim2real.stages.pipeline.open_log import open_recording
-from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.stages.pipeline.robot_flags import RobotFlags
 from sim2real.stages.shared import identification as shared
 
@@ -77,9 +77,9 @@ ARM = """<mujoco>
 
 def make_case(name: str, budget: Mapping[str, Any]) -> Case:
     """Return the case of a pipeline, with its settings, but for those of the budget."""
-    pipeline = load_pipeline(name)
-    robot: Any = pipeline.load()
-    config = replace(pipeline.identify, **budget)
+    pipeline = load_robot(name)
+    robot: Any = pipeline
+    config = replace(pipeline.defaults.identify, **budget)
     return Case(name, config, robot, robot.identifiable(config.max_delay_s))
 
 
@@ -151,18 +151,18 @@ def _fit_described(name: str, fold: Fold, seed: int) -> Fit:
         logs, model = _written(fold.fitted, Path(folder), gains), _model(fold.fitted, Path(folder))
         with contextlib.redirect_stderr(io.StringIO()):  # drops the messages on columns, which repeat for each fold
             flags = RobotFlags(mjcf=model, **{**constants.get("flags", {}), "as_told": True})
-            pipeline = from_model.describe_robot(flags, [str(p) for p in logs]).pipeline
+            pipeline = from_model.describe_robot(flags, [str(p) for p in logs]).made()
         wanted = "auto" if name in CHOOSES else constants.get("terms", "own")
-        robot = shared.offering(pipeline.load(), wanted)
-        fitted = {str(p): open_recording(p, pipeline, robot).episode for p in logs}
-    config = replace(pipeline.identify, seed=seed)
+        robot = shared.offering(pipeline, wanted)
+        fitted = {str(p): open_recording(p, robot).episode for p in logs}
+    config = replace(pipeline.defaults.identify, seed=seed)
     model = robot.identifiable(config.max_delay_s)
     case = Case(name, shared.with_length(config, model), robot, model)
     identified = _fit_with_terms(case, fitted) if wanted == "auto" else identify(case, fitted)
 
     def predict(test_recordings: Sequence[Recording]) -> list[np.ndarray]:
         with tempfile.TemporaryDirectory() as folder:
-            test = [open_recording(p, pipeline, robot).episode for p in _written(test_recordings, Path(folder), gains)]
+            test = [open_recording(p, robot).episode for p in _written(test_recordings, Path(folder), gains)]
         columns = _free_run(case, identified.values, test, test_recordings)
         return [_at(case, columns, r, one, started=True) for r, one in enumerate(test_recordings)]
 

@@ -27,9 +27,9 @@ from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
 from sim2real.log.importing.importer import import_file
 from sim2real.log.importing.mapping import load_mapping
+from sim2real.stages.load import folder_of
 from sim2real.stages.pipeline import from_model
 from sim2real.stages.pipeline.open_log import open_recording
-from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.stages.pipeline.robot_flags import RobotFlags
 
 DISK_BLOCK, DISK_BLOCKS, PAST = 5000, 5, 12
@@ -120,7 +120,7 @@ def load(case: str, data: Path, spec: str, past: int = 0) -> dict[str, Episode]:
 
 
 def _mapping(case: str) -> Path:
-    return Path(str(load_pipeline(case).load("__init__").__file__)).with_name("import.toml")
+    return folder_of(case) / "import.toml"
 
 
 def _load_disk(files: list[Path], spec: str, past: int) -> dict[str, Episode]:
@@ -349,17 +349,17 @@ def described(about: dict[str, Any], folder: str, data: Path) -> list[Fold]:
     chosen: dict[str, Any] = {n: tuple(v) if isinstance(v, list) else v for n, v in words.items() if n != "mapping"}
     mapping = where / words["mapping"] if "mapping" in words else None
     flags = RobotFlags(mjcf=where / about["mjcf"], mapping=mapping, **chosen)
-    pipeline = from_model.describe_robot(flags, [str(where / parts["fit"][0][0])]).pipeline
+    pipeline = from_model.describe_robot(flags, [str(where / parts["fit"][0][0])]).made()
     constants = {"mjcf": str(flags.mjcf), "flags": chosen, "terms": about.get("terms", "own")}
 
     def read(name: str, low: float, high: float, ahead: bool) -> Recording:
-        episode = open_recording(where / name, pipeline, pipeline.load()).episode
+        episode = open_recording(where / name, pipeline).episode
         sent = [c for c in ("goal", *FORCES) if c in episode.outputs["actuator"]]
         if not sent:
             raise UsageError(f"{where / name} has no goal, torque or duty", hint="name its columns, or give a mapping")
         whole = recording(episode, sent[0], "position")
         begin, end = (round(x * len(whole.t)) for x in (low, high))
-        about_it = {**constants, "command": sent[0], "sliding": bool(pipeline.load().units.get("position") == "m")}
+        about_it = {**constants, "command": sent[0], "sliding": bool(pipeline.units.get("position") == "m")}
         return replace(part(whole.t, whole.command, whole.position, begin, end, ahead), constants=about_it)
 
     fitted, test = (tuple(read(*p, n == "fit") for p in parts[n]) for n in ("fit", "test"))

@@ -12,7 +12,7 @@ from benches.runs import stages
 
 from sim2real.artifacts.recording import Recording
 from sim2real.stages.identify.true_values import true_values
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_module
 
 SETTLE_S = 0.3
 QUICK = {
@@ -86,7 +86,7 @@ def prediction_ratio(log: Path, truth: Path, predictions: Path) -> tuple[float, 
     recording = Recording.load(log, truth)
     episode, true = recording.episode, true_values(recording)
     samples = np.load(predictions)
-    plant_class = load_pipeline("pendulum").load("plant").PendulumPlant
+    plant_class = load_module("pendulum", "plant").PendulumPlant
     ours, theirs = [], []
     for segment in np.unique(samples["segment"][samples["held_out"]]):
         pick = samples["segment"] == segment

@@ -97,7 +97,7 @@ def estimate(ms: float, file: str, options: argparse.Namespace) -> dict[str, Any
 
 def differences(name: str, estimates: Mapping[float, Mapping[str, float]]) -> list[str]:
     """Return the flags of the parameters and delays that differ between the episodes of a policy's training."""
-    from sim2real.stages.pipeline.pipeline import load_pipeline
+    from sim2real.stages.load import load_robot
 
     if name.startswith(IDENTIFIED):
         # A uniform draw within sqrt(3) deviations has the estimate's deviation.
@@ -108,10 +108,10 @@ def differences(name: str, estimates: Mapping[float, Mapping[str, float]]) -> li
     elif name == "wide":
         ranges = {n: (low / 1e3, high / 1e3) for n, (low, high) in WIDE_MS.items()}
     else:
-        pipeline = load_pipeline(PIPELINE)
-        robot: Any = pipeline.load()
+        pipeline = load_robot(PIPELINE)
+        robot: Any = pipeline
         usual = robot.nominal() | dict.fromkeys(WIDE_MS, 0.0)
-        ranges = {n: (usual[n], usual[n] + 1e-6) for n in pipeline.train.vary.range}
+        ranges = {n: (usual[n], usual[n] + 1e-6) for n in pipeline.defaults.train.vary.range}
     return [word for n, (low, high) in ranges.items() for word in ("--vary.range", n, f"{low:.7f}", f"{high:.7f}")]
 
 

@@ -114,11 +114,11 @@ def first_step() -> float:
     import jax
     import jax.numpy as jnp
 
-    from sim2real.stages.pipeline.pipeline import load_pipeline
+    from sim2real.stages.load import load_robot
     from sim2real.stages.train.training_setup import prepare
 
-    pipeline = load_pipeline(PIPELINE)
-    env, keys = prepare(pipeline, pipeline.train).env, jax.random.split(jax.random.key(0), 8)
+    pipeline = load_robot(PIPELINE)
+    env, keys = prepare(pipeline, pipeline.defaults.train).env, jax.random.split(jax.random.key(0), 8)
     state, _ = jax.jit(jax.vmap(env.reset))(keys)
     jax.block_until_ready(jax.jit(jax.vmap(env.step))(state, jnp.zeros((8, 12)), keys))
     return time.perf_counter() - begin

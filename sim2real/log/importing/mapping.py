@@ -6,7 +6,6 @@ import difflib
 import json
 import math
 import re
-import sys
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -194,24 +193,15 @@ class _Document(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_de
     nodes: dict[str, dict[str, Json]] = {}
 
 
-def load_mapping(path: str | Path | None, pipeline: str | None = None, package: str | None = None) -> ImportMapping:
+def load_mapping(path: str | Path, pipeline: str | None = None) -> ImportMapping:
     """Read a mapping file.
 
     Args:
-        path: The file; None: the one in the pipeline's package.
         pipeline: Pipeline of the log; default: the file's.
-        package: Name of the pipeline's package, which must be imported.
 
     Raises:
         UsageError: When the file does not exist, is not TOML, is no valid mapping, or has an open question.
     """
-    if path is None and package is not None:
-        path = Path(str(sys.modules[package].__file__)).with_name(MAPPING)
-    if path is None:
-        raise UsageError(
-            "there is no mapping of the file's signals",
-            hint="name the robot with --pipeline NAME, or a --mapping FILE.toml",
-        )
     # Read the document, with errors that name the file.
     path = Path(path)
     try:

@@ -234,7 +234,7 @@ class MjcfRobot(LoggedRobot):
             *(() if "volts" in self.config.commands else ("voltage",)),
         }
         terms = (t for t in offered if t.free or t.what not in without)
-        return MjcfRobot(replace(self.config, terms=tuple(terms)))
+        return MjcfRobot(replace(self.config, terms=tuple(terms))).called_like(self)
 
     def identifiable(self, max_delay_s: float) -> IdentifiableMjcf:
         """Return the model to identify, with a delay of up to ``max_delay_s`` [s]."""

@@ -94,7 +94,7 @@ class ComposedRobot(Robot):
     def commanded(self, command: tuple[float, float, float]) -> ComposedRobot:
         """Return the robot with this command in all trials."""
         kind = type(type(self).__name__, (type(self),), {"commands": replace(self.commands, fixed=command)})
-        return kind()
+        return kind().called_like(self)
 
     def nominal(self) -> dict[str, float]:
         """Return the nominal values of the model's parameters, and the delays."""

@@ -25,14 +25,13 @@ from sim2real.identification.segments import Span, check_log
 from sim2real.installation import has_jax
 from sim2real.log.importing.names import about_torque
 from sim2real.log.schema import unit_of
-from sim2real.robots.robot import Robot, in_world
+from sim2real.robots.robot import RecordedRobot, Robot, in_world
 from sim2real.stages.check.config import CheckConfig
 from sim2real.stages.excitation.played import played
 from sim2real.stages.identify.config import IdentifyConfig
-from sim2real.stages.pipeline.load_robot import moving_robot
+from sim2real.stages.load import AnyRobot, defaults_of, robot_of
 from sim2real.stages.pipeline.open_log import open_recording
-from sim2real.stages.pipeline.pipeline import Pipeline, pipeline_of
-from sim2real.stages.pipeline.python_arguments import AnyRecording, AnyRobot, config_of, recordings_of
+from sim2real.stages.pipeline.python_arguments import AnyRecording, config_of, recordings_of
 from sim2real.stages.shared.identification import command, side_by_side, usable
 from sim2real.stages.terminal.console import artifact_table, note, pairs, progress, shown
 from sim2real.types import Json
@@ -243,13 +242,13 @@ class Checked(Shown):
         return ArtifactTable(headers, rows)
 
 
-def run(pipeline: Pipeline, config: CheckConfig) -> bool:
+def run(robot: RecordedRobot, config: CheckConfig) -> bool:
     """Judge recordings and print the result: the verdict and the next command first.
 
     Returns:
         Whether every parameter is determined; of the delays the sum suffices.
     """
-    checked = check(pipeline, None, config)
+    checked = check(robot, None, config)
     if config.json:
         more = {"determined": checked.determined, "verdict": checked.verdict, "recommendation": checked.recommendation}
         print(to_json({**plain(checked), **more}).decode())
@@ -275,7 +274,7 @@ def check(
     """Predict which parameters recordings can determine, before a search.
 
     Args:
-        robot: The robot, its pipeline, or the pipeline's name.
+        robot: The robot, or the name of its pipeline.
         recording: One recording, or several; or the paths of their logs. None: the logs that ``config`` names, the
             newest recording in its ``runs``, or, without one, the planned excitation.
         config: A dict holds the fields that differ from the default.
@@ -284,20 +283,20 @@ def check(
         NotInstalled: JAX is not installed; the coverage of the recordings is printed before.
     """
     # Make the model that identify would fit.
-    pipeline = pipeline_of(robot)
-    config = config_of(config, CheckConfig(record=pipeline.record))
-    robot = in_world(pipeline.load(), config.world)
+    robot = robot_of(robot)
+    config = config_of(config, CheckConfig(record=defaults_of(robot).record))
+    robot = in_world(robot, config.world)
     # The squared loss, because a robust loss would hide the errors of the nominal model.
-    fitting = replace(pipeline.identify, bounds=config.bounds, fix=config.fix, loss="squared")
+    fitting = replace(defaults_of(robot).identify, bounds=config.bounds, fix=config.fix, loss="squared")
     model = robot.identifiable(fitting.max_delay_s)
     parameters = model.parameters.with_bounds(config.bounds).with_fixed(config.fix)
     # Open the recordings, or simulate the planned one.
     if recording is None:
-        logs = find_logs(pipeline, config)
+        logs = find_logs(robot, config)
         planned = not logs
-        logs = logs or {PLANNED: _planned(pipeline, config, model, parameters, fitting)}
+        logs = logs or {PLANNED: _planned(robot, config, model, parameters, fitting)}
     else:
-        recordings = recordings_of(recording, pipeline)
+        recordings = recordings_of(recording, robot)
         config, planned = replace(config, log=tuple(str(log.path) for log in recordings), plan=False), False
         logs = {shown(log.path): log.episode for log in recordings}
     model = measured_channels(model, list(logs.values()))
@@ -313,51 +312,51 @@ def check(
                 recording_.show()
         raise NotInstalled(
             "which parameters this recording determines is computed with JAX, which is not installed here",
-            hint=f"copy it to a computer with sim2real: `sim2real check {pipeline.name} --log LOG`",
+            hint=f"copy it to a computer with sim2real: `sim2real check {robot.name} --log LOG`",
         )
     with progress(None, "check: simulate"):
         checked = determine(model, list(logs.values()), fitting, parameters)
     # Name the next command: where a parameter is not determined, it plans or records another motion.
     flags = {"log": config.log, "bounds": config.bounds, "fix": config.fix, "world": config.world}
-    following = command(pipeline, replace(pipeline.identify, **flags), config.runs)
+    following = command(robot, replace(defaults_of(robot).identify, **flags), config.runs)
     if isinstance(robot, Robot) and not checked.determined:
-        following = f"sim2real check {pipeline.name} --plan --record.excitation KIND, then record what suffices"
+        following = f"sim2real check {robot.name} --plan --record.excitation KIND, then record what suffices"
     elif not checked.determined:
         following = f"record such a motion, or hold a known value: {following} --fix {checked.undetermined[0][0]} VALUE"
     elif planned:
-        following = f"sim2real record {pipeline.name}"
+        following = f"sim2real record {robot.name}"
     source = PLANNED if planned else "log"
-    return replace(checked, pipeline=pipeline.name, source=source, recordings=covered, following=following)
+    return replace(checked, pipeline=robot.name, source=source, recordings=covered, following=following)
 
 
-def find_logs(pipeline: Pipeline, config: CheckConfig) -> dict[str, Episode]:
+def find_logs(robot: RecordedRobot, config: CheckConfig) -> dict[str, Episode]:
     """Return the logs that the configuration names, or the newest recording; empty if an excitation is planned."""
-    paths, robot = [Path(p) for p in config.log], pipeline.load()
+    paths = [Path(p) for p in config.log]
     if not paths and not config.plan:
         try:
-            paths = newest(config.runs, pipeline.name, "record").logs()
+            paths = newest(config.runs, robot.name, "record").logs()
         except Sim2RealError as error:
             if not isinstance(robot, Robot):
                 raise UsageError(
-                    f"there is no recording of {pipeline.name!r} in {shown(config.runs)}, and the pipeline has no "
+                    f"there is no recording of {robot.name!r} in {shown(config.runs)}, and the pipeline has no "
                     "excitation to plan one with",
-                    hint=f"name a log with --log FILE, or `sim2real import FILE --pipeline {pipeline.name}`",
+                    hint=f"name a log with --log FILE, or `sim2real import FILE --pipeline {robot.name}`",
                 ) from error
-            note(f"no recording of {pipeline.name} in {shown(config.runs)}: the planned excitation is simulated")
-    return {shown(p): open_recording(p, pipeline, robot).episode for p in paths}
+            note(f"no recording of {robot.name} in {shown(config.runs)}: the planned excitation is simulated")
+    return {shown(p): open_recording(p, robot).episode for p in paths}
 
 
 def _planned(
-    pipeline: Pipeline,
+    robot: RecordedRobot,
     config: CheckConfig,
     model: IdentifiableModel,
     parameters: ParameterTable,
     fitting: IdentifyConfig,
 ) -> Episode:
     """Return a simulation of the planned excitation, at the nominal values."""
-    if not isinstance(pipeline.load(), Robot):
+    if not isinstance(robot, Robot):
         raise UsageError(
-            f"pipeline {pipeline.name!r} has no excitation to plan a recording with", hint="name a log with --log FILE"
+            f"pipeline {robot.name!r} has no excitation to plan a recording with", hint="name a log with --log FILE"
         )
     if config.record.by_hand:
         raise UsageError(
@@ -370,11 +369,10 @@ def _planned(
         raise NotInstalled("a plan is simulated with JAX, which is not installed here", hint="name a log with --log")
     from sim2real.stages.excitation.simulated_log import simulate  # JAX programs
 
-    moving = moving_robot(pipeline)
-    signal = moving.drive.around(played(config.record, pipeline, moving))
+    signal = robot.drive.around(played(config.record, robot))
     table = parameters.for_recordings(1)
     values = table.of_recording(table.decode(table.start()), 0)
-    return simulate(model, moving, signal, values, fitting, config.record.seed)
+    return simulate(model, robot, signal, values, fitting, config.record.seed)
 
 
 def _time(seconds: float) -> str:

@@ -25,7 +25,6 @@ from sim2real.stages.live.scene import scene_of
 from sim2real.stages.live.viewer import live_view
 from sim2real.stages.on_robot.episode import check_deadlines, run_episode
 from sim2real.stages.on_robot.open_robot import announce_following, opened
-from sim2real.stages.pipeline.pipeline import Pipeline
 from sim2real.stages.terminal.console import note
 from sim2real.types import Json
 
@@ -33,7 +32,6 @@ PolicyRunner = BlendedRunner | UprightRunner
 
 
 def run_episodes(
-    pipeline: Pipeline,
     robot: Robot,
     bundle: Bundle,
     config: DeployConfig,
@@ -50,16 +48,16 @@ def run_episodes(
         Sim2RealError: The cause that stopped the robot.
     """
     policy, folder = _policy_runner(bundle, robot, config), logs[0].parent
-    scene = partial(scene_of, pipeline, robot)
-    with live_view(config.view, folder, pipeline.name, scene), opened(robot, config, folder / TRUTH) as session:
+    scene = partial(scene_of, robot)
+    with live_view(config.view, folder, robot.name, scene), opened(robot, config, folder / TRUTH) as session:
         if config.hold and session.rig.gate.config.stale != "hold":
             raise UsageError("this robot's motors hold no position", hint="run without --hold")
         if following is not None:
             session.rig.follow(following)
         announce_following(session.rig)
         # Measure the delay before the policy moves the robot: a policy trained for another delay may oscillate.
-        delay = _measure_delay(pipeline, robot, session, bundle, config, folder)
-        summaries = [_run_one(pipeline, robot, session, policy, i, log, config) for i, log in enumerate(logs)]
+        delay = _measure_delay(robot, session, bundle, config, folder)
+        summaries = [_run_one(robot, session, policy, i, log, config) for i, log in enumerate(logs)]
     return [{**summary, **delay} for summary in summaries]
 
 
@@ -78,7 +76,7 @@ def _policy_runner(bundle: Bundle, robot: Robot, config: DeployConfig) -> Policy
 
 
 def _measure_delay(
-    pipeline: Pipeline, robot: Robot, session: Session, bundle: Bundle, config: DeployConfig, folder: Path
+    robot: Robot, session: Session, bundle: Bundle, config: DeployConfig, folder: Path
 ) -> dict[str, str]:
     """Bring the robot to rest, measure its delay with small steps and log them; return a line of the summary."""
     if config.dry_run or not config.measure_delay or robot.drive.probe is None:
@@ -89,11 +87,10 @@ def _measure_delay(
     try:
         return check_delay(robot, witness, bundle.contract, config)
     finally:
-        _write_probe(folder, pipeline, robot, witness)
+        _write_probe(folder, robot, witness)
 
 
 def _run_one(
-    pipeline: Pipeline,
     robot: Robot,
     session: Session,
     policy: PolicyRunner,
@@ -109,7 +106,7 @@ def _run_one(
         note(f"waiting for the robot to come to rest, then {length}")
         robot.drive.prepare(session, config.settle_s)
     nodes, params = robot.deployment_nodes(session, policy, trial)
-    return run_episode(pipeline, robot, session, nodes, params, log, config.duration_s, config, "deploy", config.hold)
+    return run_episode(robot, session, nodes, params, log, config.duration_s, config, "deploy", config.hold)
 
 
 # -- the test of the delay, and its log: the model is tested on it as on an episode
@@ -168,7 +165,7 @@ def misfit(answers: StepAnswers, trained: tuple[float, float], tolerance_s: floa
     return None
 
 
-def _write_probe(folder: Path, pipeline: Pipeline, robot: Robot, witness: Witness) -> Path | None:
+def _write_probe(folder: Path, robot: Robot, witness: Witness) -> Path | None:
     """Write the commands and measurements of the steps at the robot's rate; return the log.
 
     The steps ran faster than that. The log omits the measurements in between, so that a second of it weighs as much as
@@ -188,7 +185,7 @@ def _write_probe(folder: Path, pipeline: Pipeline, robot: Robot, witness: Witnes
     # Write them as steps of the sensor and the actuator.
     outputs = {sensor: robot.sensor.at_rest, actuator: robot.drive.message(np.zeros(len(robot.agent.action)))}
     graph = {n: {"rate_hz": robot.rate_hz, "delay_s": 0.0, "inputs": {}} for n in outputs}
-    metadata = {"pipeline": pipeline.name, "dry_run": False, "graph": graph, "probe": True}
+    metadata = {"pipeline": robot.name, "dry_run": False, "graph": graph, "probe": True}
     joints, units = {sensor: robot.sensor.joints}, dict.fromkeys(outputs, robot.units)
     recorder = McapRecorder(folder / PROBE, metadata, {}, outputs, [], joints, units)
     recorder.start(0, start_ns)

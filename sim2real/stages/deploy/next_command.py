@@ -8,9 +8,9 @@ from pathlib import Path
 from sim2real.artifacts.deployment import Advice, Deployment, Drift
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.run import MANIFEST
-from sim2real.robots.robot import in_world
+from sim2real.robots.robot import RecordedRobot, in_world
 from sim2real.stages.deploy.trajectories import PAUSED
-from sim2real.stages.pipeline.pipeline import Pipeline
+from sim2real.stages.load import defaults_of
 from sim2real.stages.shared.identification import command
 from sim2real.stages.terminal.console import shown
 
@@ -21,7 +21,7 @@ ENOUGH_S = 12.0
 
 
 def with_command(
-    advice: Advice, pipeline: Pipeline, identification: Identification | None, folder: Path, deployment: Deployment
+    advice: Advice, robot: RecordedRobot, identification: Identification | None, folder: Path, deployment: Deployment
 ) -> Advice:
     """Return advice with the command that carries it out.
 
@@ -31,26 +31,28 @@ def with_command(
     if advice.status == "fine" or advice.joint:
         return advice
     run = ["--run", shown(folder.parent)] if (folder / MANIFEST).is_file() else []
-    train = shlex.join(["sim2real", "train", pipeline.name, *run])
+    train = shlex.join(["sim2real", "train", robot.name, *run])
     if identification is None:
-        return replace(advice, next=shlex.join(["sim2real", "identify", pipeline.name, *run]))
+        return replace(advice, next=shlex.join(["sim2real", "identify", robot.name, *run]))
     logs = logs_to_identify([r.path for r in deployment.logs], deployment.drift, identification, folder)
-    terms = terms_to_identify(pipeline.identify.terms, pipeline, identification, deployment.drift)
+    terms = terms_to_identify(defaults_of(robot).identify.terms, robot, identification, deployment.drift)
     if advice.status == "not judged" and any(PAUSED in reason for reason in advice.reasons):
-        return replace(advice, next=shlex.join(["sim2real", "deploy", pipeline.name, *run]))
+        return replace(advice, next=shlex.join(["sim2real", "deploy", robot.name, *run]))
     # Without logs that suffice the robot is recorded first.
     if advice.status == "not judged" or not logs:
-        record = shlex.join(["sim2real", "record", pipeline.name])
-        identify = shlex.join(["sim2real", "identify", pipeline.name, "--terms", terms])
-        return replace(advice, next=record if terms == pipeline.identify.terms else f"{record} && {identify}")
-    config = replace(pipeline.identify, log=logs, terms=terms)
-    identify = command(pipeline, config, Path("runs"), shlex.join(run))
+        record = shlex.join(["sim2real", "record", robot.name])
+        identify = shlex.join(["sim2real", "identify", robot.name, "--terms", terms])
+        return replace(advice, next=record if terms == defaults_of(robot).identify.terms else f"{record} && {identify}")
+    config = replace(defaults_of(robot).identify, log=logs, terms=terms)
+    identify = command(robot, config, Path("runs"), shlex.join(run))
     if advice.status == "re-identify":
         return replace(advice, next=identify)
     return replace(advice, next=f"{identify} && {train}" if needs_timing(advice) else train)
 
 
-def terms_to_identify(configured: str, pipeline: Pipeline, identification: Identification, drift: Drift | None) -> str:
+def terms_to_identify(
+    configured: str, robot: RecordedRobot, identification: Identification, drift: Drift | None
+) -> str:
     """Return the optional terms to identify with: those of the identification, and that of the parameter that changed.
 
     A model without the changed term, such as a payload, bends its other parameters instead.
@@ -60,7 +62,7 @@ def terms_to_identify(configured: str, pipeline: Pipeline, identification: Ident
     """
     if configured in ("auto", "all"):
         return configured
-    robot, max_delay_s = in_world(pipeline.load(), identification.world), pipeline.identify.max_delay_s
+    robot, max_delay_s = in_world(robot, identification.world), defaults_of(robot).identify.max_delay_s
     watched, default = robot.watched(max_delay_s).parameters, robot.identifiable(max_delay_s).parameters.terms
     changed = (drift.named or drift.likely) if drift is not None else None
     added = [p.term for p in watched if changed is not None and p.name == changed.name and p.term]

@@ -9,16 +9,18 @@ from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.run import StageFolder, newest, sha256
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.policy.contract import ActionTerm, ObservationTerm
-from sim2real.robots.robot import Robot
+from sim2real.robots.robot import RecordedRobot, Robot
 from sim2real.stages.deploy.config import DeployConfig
+from sim2real.stages.load import shipped_policy
 from sim2real.stages.pipeline.find_run import warn_of_stale
-from sim2real.stages.pipeline.pipeline import Pipeline
 from sim2real.stages.terminal.console import note
 
 _TRAIN, EMBEDDED = "train a policy for this pipeline", "embedded"
 
 
-def find_bundle(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | None) -> tuple[Path, Path | None]:
+def find_bundle(
+    robot: RecordedRobot, config: DeployConfig, root: Path, run_dir: Path | None
+) -> tuple[Path, Path | None]:
     """Return the bundle's folder and the run folder to add to.
 
     The bundle is that of the flag, of the newest training, or the one that the pipeline ships.
@@ -26,12 +28,12 @@ def find_bundle(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: P
     if config.bundle is not None:
         return Path(config.bundle), run_dir
     try:
-        training = newest(root, pipeline.name, "train", run_dir)
+        training = newest(root, robot.name, "train", run_dir)
     except Sim2RealError:
-        if not pipeline.shipped.is_dir():
+        if (shipped := shipped_policy(robot.folder)) is None:
             raise
-        note(f"pipeline {pipeline.name!r} has no training here: its shipped policy is deployed")
-        return pipeline.shipped, run_dir
+        note(f"pipeline {robot.name!r} has no training here: its shipped policy is deployed")
+        return shipped, run_dir
     training = warn_of_stale(training)
     require_untouched(training)
     return training.output("bundle"), run_dir or training.run_dir
@@ -51,13 +53,13 @@ def require_untouched(training: StageFolder) -> None:
         )
 
 
-def require_fit(pipeline: Pipeline, robot: Robot, bundle: Bundle, config: DeployConfig) -> None:
+def require_fit(robot: Robot, bundle: Bundle, config: DeployConfig) -> None:
     """Refuse a bundle for another robot, or one that exceeds the limits of this robot.
 
     Raises:
         Sim2RealError: Names the difference.
     """
-    _require_robot(pipeline, bundle, config)
+    _require_robot(robot, bundle, config)
     if config.max_tilt_rad is not None and robot.agent.tilt_rad is None:
         raise UsageError("this robot does not measure its tilt", hint="run without --max-tilt-rad, or set tilt_rad")
     contract, where = bundle.contract, f"in {bundle.path}" if bundle.path else "that was trained"
@@ -96,12 +98,12 @@ def require_fit(pipeline: Pipeline, robot: Robot, bundle: Bundle, config: Deploy
             )
 
 
-def _require_robot(pipeline: Pipeline, bundle: Bundle, config: DeployConfig) -> None:
+def _require_robot(robot: RecordedRobot, bundle: Bundle, config: DeployConfig) -> None:
     """Refuse a policy of another robot: of another pipeline, or of the emulated one on a port, and the reverse."""
     trained, port = bundle.contract.robot, bundle.contract.port
     where = f" in {bundle.path}" if bundle.path else ""
-    if trained and pipeline.has_commands and trained != pipeline.name:
-        raise Sim2RealError(f"the policy{where} was trained for {trained!r}, this is {pipeline.name!r}", hint=_TRAIN)
+    if trained and robot.folder is not None and trained != robot.name:
+        raise Sim2RealError(f"the policy{where} was trained for {trained!r}, this is {robot.name!r}", hint=_TRAIN)
     if not port or (port == EMBEDDED) == (config.port == EMBEDDED):
         return
     names = {True: "the emulated robot", False: "a robot"}

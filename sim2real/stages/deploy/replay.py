@@ -21,7 +21,6 @@ from sim2real.identification.problem import Problem
 from sim2real.identification.segments import Span
 from sim2real.robots.robot import RecordedRobot
 from sim2real.stages.identify.config import IdentifyConfig
-from sim2real.stages.pipeline.pipeline import Pipeline
 from sim2real.stages.shared.identification import identified_robot, side_by_side
 
 _REPETITIONS = 16
@@ -34,7 +33,7 @@ _LEAST, _LEAST_S = 4, 5.0
 
 
 def tested(
-    pipeline: Pipeline, identification: Identification, episodes: Sequence[Episode]
+    robot: RecordedRobot, identification: Identification, episodes: Sequence[Episode]
 ) -> tuple[list[Replay], Drift]:
     """Replay recorded commands on the identified and the nominal model, and test the parameters.
 
@@ -43,7 +42,7 @@ def tested(
     Raises:
         Sim2RealError: When the logs are too short, or the identification does not fit the robot.
     """
-    robot, config = identified_robot(identification, pipeline)
+    robot, config = identified_robot(identification, robot)
     problem, ahead_s = _problem(robot, identification, episodes, config)
     if identification.posterior is None:
         ended = UNFINISHED.get(identification.verdict.status, "has no intervals")

@@ -14,19 +14,18 @@ from sim2real.artifacts.run import StageFolder, finished, open_stage
 from sim2real.errors import UsageError
 from sim2real.hardware.safety.following import Following
 from sim2real.installation import has_jax
-from sim2real.robots.robot import Robot, in_world
+from sim2real.robots.robot import RecordedRobot, Robot, in_world
 from sim2real.stages.deploy.config import DeployConfig
 from sim2real.stages.deploy.episodes import check_timing, run_episodes
 from sim2real.stages.deploy.preflight import find_bundle, require_fit
 from sim2real.stages.deploy.show import show, show_sessions, summary_lines
+from sim2real.stages.load import AnyRobot, defaults_of, moving, robot_of
 from sim2real.stages.pipeline import python_arguments
-from sim2real.stages.pipeline.load_robot import moving_robot
 from sim2real.stages.pipeline.open_parameters import check_parameters, open_identification
-from sim2real.stages.pipeline.pipeline import Pipeline, pipeline_of
 
 
 def deploy(
-    robot: Robot | Pipeline | str,
+    robot: AnyRobot,
     bundle: python_arguments.AnyBundle,
     folder: python_arguments.AnyPath,
     config: DeployConfig | Mapping[str, object] | None = None,
@@ -35,10 +34,10 @@ def deploy(
     """Run a policy on the robot, and compare with the simulation.
 
     Args:
-        robot: The robot, its pipeline, or the pipeline's name.
+        robot: The robot, or the name of its pipeline.
         bundle: The policy, or its folder.
         folder: Folder for the logs; a log is never overwritten.
-        config: Default: that of the pipeline that loaded the robot. A dict holds the fields that differ from it. The
+        config: Default: that of the robot. A dict holds the fields that differ from it. The
             field ``bundle`` is ignored.
         identification: Parameters of the simulation, or their folder; without them there is no gap report.
 
@@ -49,20 +48,19 @@ def deploy(
         Sim2RealError: The policy does not fit the robot, or the cause that stopped the robot.
     """
     # Check all arguments before the robot moves.
-    pipeline = pipeline_of(robot)
+    robot = robot_of(robot)
     bundle, folder = python_arguments.bundle_of(bundle), python_arguments.folder_of(folder)
-    config = python_arguments.config_of(config, pipeline.deploy)
+    config = python_arguments.config_of(config, defaults_of(robot).deploy)
     if identification is not None:
         identification = python_arguments.identification_of(identification)
-    robot = _commanded(moving_robot(pipeline), pipeline, config)
-    require_fit(pipeline, robot, bundle, config)
+    robot = _commanded(moving(robot), config)
+    require_fit(robot, bundle, config)
     if identification is not None:
-        check_parameters(identification, pipeline)
-    return _deployed(pipeline, robot, bundle, folder, config, identification)
+        check_parameters(identification, robot)
+    return _deployed(robot, bundle, folder, config, identification)
 
 
 def _deployed(
-    pipeline: Pipeline,
     robot: Robot,
     bundle: Bundle,
     folder: Path,
@@ -73,7 +71,7 @@ def _deployed(
     # Run the episodes on the robot.
     logs = [log_of(folder, i) for i in range(config.episodes)]
     following = None if identification is None else _following(robot, identification)
-    summaries = run_episodes(pipeline, robot, bundle, config, logs, following)
+    summaries = run_episodes(robot, bundle, config, logs, following)
     recordings = [Recording.load(log, folder / TRUTH) for log in logs]
     if config.dry_run:
         # The robot did not move: there are no scores and no gap.
@@ -91,28 +89,28 @@ def _deployed(
     deployment = replace(deployment, probe=Recording.load(probe, folder / TRUTH) if probe.is_file() else None)
 
     # Judge the model and the policy.
-    return replace(judge(deployment, pipeline, bundle, identification, folder), summary=tuple(summaries))
+    return replace(judge(deployment, robot, bundle, identification, folder), summary=tuple(summaries))
 
 
-def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | None) -> StageFolder:
+def run(robot: RecordedRobot, config: DeployConfig, root: Path, run_dir: Path | None) -> StageFolder:
     """Deploy the policy; write logs, scores and the gap to simulation into a stage folder. A dry run writes logs alone.
 
     Args:
         run_dir: Run folder to add to; None takes that of the bundle.
     """
     # Check the bundle before a folder is made.
-    robot = _commanded(moving_robot(pipeline), pipeline, config)
-    path, run_dir = find_bundle(pipeline, config, root, run_dir)
+    robot = _commanded(moving(robot), config)
+    path, run_dir = find_bundle(robot, config, root, run_dir)
     bundle = Bundle.load(path)
-    require_fit(pipeline, robot, bundle, config)
-    with open_stage(root, pipeline.name, "deploy", config, {"bundle": path}, run_dir, config.dry_run) as stage:
+    require_fit(robot, bundle, config)
+    with open_stage(root, robot.name, "deploy", config, {"bundle": path}, run_dir, config.dry_run) as stage:
         # Name the logs first, so that the manifest of an interrupted deployment lists them.
         for i in range(config.episodes):
             stage.output(f"log_{i}", log_of(stage.folder, i).name)
         if config.port == "embedded":
             stage.output("truth", TRUTH)
-        identification = _identification(pipeline, stage.run_dir)
-        deployment = _deployed(pipeline, robot, bundle, stage.folder, config, identification)
+        identification = _identification(robot, stage.run_dir)
+        deployment = _deployed(robot, bundle, stage.folder, config, identification)
         summaries = deployment.summary
         show_sessions(summaries, config.dry_run)
 
@@ -130,12 +128,12 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
     return stage.result
 
 
-def _commanded(robot: Robot, pipeline: Pipeline, config: DeployConfig) -> Robot:
+def _commanded(robot: Robot, config: DeployConfig) -> Robot:
     """Return the robot with the configured command."""
     if config.command is not None:
         commanded = getattr(robot, "commanded", None)
         if commanded is None:
-            raise UsageError(f"pipeline {pipeline.name!r} follows no velocity", hint="run it without --command")
+            raise UsageError(f"pipeline {robot.name!r} follows no velocity", hint="run it without --command")
         robot = commanded(config.command)
     robot.task.at_rest(0)  # a task that needs JAX is refused before the robot moves
     return robot
@@ -150,7 +148,7 @@ def _following(robot: Robot, identification: Identification) -> Following | None
     return replace(following, delay_s=delays[0]) if delays else None
 
 
-def _identification(pipeline: Pipeline, run_dir: Path) -> Identification | None:
+def _identification(robot: RecordedRobot, run_dir: Path) -> Identification | None:
     """Return the run's newest identification; None if the run has none."""
     folder = finished(run_dir, "identify")
-    return None if folder is None else open_identification(folder.output("parameters"), pipeline)
+    return None if folder is None else open_identification(folder.output("parameters"), robot)

@@ -13,9 +13,9 @@ from sim2real.artifacts.identification import MAX_ERROR_RATIO, ROUND_TRIP, Ident
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import OtherMotion, Sim2RealError
 from sim2real.installation import has_jax
+from sim2real.robots.robot import RecordedRobot
 from sim2real.stages.deploy.next_command import LATER, with_command
 from sim2real.stages.deploy.trajectories import longest_pause, off_course
-from sim2real.stages.pipeline.pipeline import Pipeline
 from sim2real.stages.terminal.console import progress, shown
 from sim2real.stages.terminal.interruption import patiently
 
@@ -34,7 +34,7 @@ _MAX_SUCCESS_GAP = 0.1
 
 
 def judge(
-    deployment: Deployment, pipeline: Pipeline, bundle: Bundle, identification: Identification | None, folder: Path
+    deployment: Deployment, robot: RecordedRobot, bundle: Bundle, identification: Identification | None, folder: Path
 ) -> Deployment:
     """Return a deployment with the tests of its model, its times beside those of training, and a verdict.
 
@@ -44,7 +44,7 @@ def judge(
     """
 
     def advised(judged: Deployment, advice: Advice) -> Deployment:
-        return replace(judged, advice=with_command(advice, pipeline, identification, folder, judged))
+        return replace(judged, advice=with_command(advice, robot, identification, folder, judged))
 
     times = tuple(_times_of_training(deployment, bundle))
     deployment = replace(deployment, trained=times)
@@ -63,7 +63,7 @@ def judge(
         from sim2real.stages.deploy.replay import tested
 
         with progress(None, "test the model on the deployment"):
-            replay, drift = patiently(lambda: tested(pipeline, identification, [r.episode for r in deployment.logs]))
+            replay, drift = patiently(lambda: tested(robot, identification, [r.episode for r in deployment.logs]))
     except OtherMotion as error:
         # The policy alone is judged, beside its simulation with identified parameters.
         advice = _policy_advice(deployment, bundle) or Advice("fine", ("the policy succeeds, as in simulation",))

@@ -14,7 +14,7 @@ from sim2real.log.importing.readers import open_tables
 from sim2real.log.reader import read_log
 from sim2real.robots.loop import ACTUATOR, SENSOR
 from sim2real.robots.robot import Robot
-from sim2real.stages.pipeline.pipeline import Pipeline
+from sim2real.stages.load import mapping_of
 
 _LEAST_S = 1.0
 """Shortest motion [s]."""
@@ -35,7 +35,7 @@ class FileMotion:
     source: str
 
 
-def read_motion(path: Path, pipeline: Pipeline, robot: Robot, names: Sequence[str]) -> FileMotion:
+def read_motion(path: Path, robot: Robot, names: Sequence[str]) -> FileMotion:
     """Return the motion in a file: goals if it has them, otherwise measured positions.
 
     A log of this robot, a file that the pipeline's ``import.toml`` maps, or any file that ``sim2real import`` reads
@@ -51,7 +51,7 @@ def read_motion(path: Path, pipeline: Pipeline, robot: Robot, names: Sequence[st
         raise UsageError(f"there is no motion {path}", hint="--excitation FILE is a log, or a csv, npz or parquet file")
     if path.suffix == ".mcap":
         motion = _of_log(path, robot)
-    elif (mapping := pipeline.mapping_of(path)) is not None:
+    elif (mapping := mapping_of(robot, path)) is not None:
         episode = import_file(path, mapping)
         rows = episode.outputs[ACTUATOR][robot.drive.command]
         motion = FileMotion(episode.steps[ACTUATOR].begun_s, rows, f"{robot.drive.command} of {path.name}")

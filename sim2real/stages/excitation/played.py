@@ -6,7 +6,6 @@ from sim2real.errors import UsageError
 from sim2real.robots.robot import Robot
 from sim2real.stages.excitation.motion_file import FileMotion, read_motion
 from sim2real.stages.excitation.signals import excitation
-from sim2real.stages.pipeline.pipeline import Pipeline
 from sim2real.stages.record.config import RecordConfig
 from sim2real.stages.terminal.console import note
 
@@ -14,7 +13,7 @@ _ROUNDED = 1e-6
 """Excess over a limit that is a rounding error [the command's unit]."""
 
 
-def played(config: RecordConfig, pipeline: Pipeline, robot: Robot, announce: bool = False) -> np.ndarray:
+def played(config: RecordConfig, robot: Robot, announce: bool = False) -> np.ndarray:
     """Return the signal ``(N, commands)`` that ``RobotDrive.around`` makes commands of, one row a step.
 
     Args:
@@ -30,7 +29,7 @@ def played(config: RecordConfig, pipeline: Pipeline, robot: Robot, announce: boo
         return bent
     if config.motion is None:
         return excitation(config, robot.rate_hz, commands).reshape(-1, commands)
-    motion = read_motion(config.motion, pipeline, robot, names_of(config, robot))
+    motion = read_motion(config.motion, robot, names_of(config, robot))
     rows = _within(_sampled(motion, robot.rate_hz, config.duration_s), config, robot)
     if announce:
         skipped_s = min(motion.t_s[-1], config.duration_s) - len(rows) / robot.rate_hz

@@ -22,7 +22,6 @@ from sim2real.identification.segments import Span
 from sim2real.robots.robot import RecordedRobot, Robot, in_world
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.pipeline.open_log import require_units
-from sim2real.stages.pipeline.pipeline import Pipeline
 from sim2real.stages.shared.identification import (
     hash_of,
     offering,
@@ -45,7 +44,8 @@ class Inputs:
     """The data of an identification.
 
     Attributes:
-        robot: The robot, with the optional terms that the configuration names.
+        loaded: The robot without these.
+        robot: The robot in the configured world, with the optional terms that the configuration names.
         table: The parameters, with the bounds and fixed values of the configuration.
         logs: The fitted recordings, then those that are held out whole.
         hashes: SHA-256 of each log's file before the fit; "" for a recording without a file.
@@ -54,7 +54,7 @@ class Inputs:
         standing: The recording of a robot on its feet; None: there is none.
     """
 
-    pipeline: Pipeline
+    loaded: RecordedRobot
     config: IdentifyConfig
     robot: RecordedRobot
     model: IdentifiableModel
@@ -108,7 +108,7 @@ class Inputs:
 
 
 def prepare(
-    pipeline: Pipeline,
+    robot: RecordedRobot,
     config: IdentifyConfig,
     fitted: Sequence[Recording],
     held_out: Sequence[Recording],
@@ -118,14 +118,14 @@ def prepare(
     """Return the data of an identification.
 
     Args:
-        begin: Values at which the search begins; default: the pipeline's.
+        begin: Values at which the search begins; default: the model's.
         standing: The recording of a robot on its feet.
 
     Raises:
         UsageError: When the recordings are too short, one is given twice, or the configuration does not fit the model.
         Sim2RealError: When a recording is in other units than the robot.
     """
-    robot = robot_of(pipeline, config)
+    loaded, robot = robot, configured(robot, config)
     logs = (*fitted, *held_out)
     for log in (*logs, *([standing] if standing else [])):
         require_units(log, robot)
@@ -140,7 +140,7 @@ def prepare(
         weighing.check(robot, standing.episode, {p.name: p.nominal for p in model.parameters})
     windows = spans([log.episode for log in logs], len(fitted), config, config.settle_s + config.horizon_s)
     hashes = tuple(hash_of(log) for log in logs)
-    return Inputs(pipeline, config, robot, model, table, logs, hashes, len(fitted), windows, standing=standing)
+    return Inputs(loaded, config, robot, model, table, logs, hashes, len(fitted), windows, standing=standing)
 
 
 def with_load(
@@ -166,7 +166,7 @@ def storing_refits(inputs: Inputs, folder: Path, root: Path) -> Iterator[Inputs]
     Args:
         root: Folder of all runs.
     """
-    files = (root / inputs.pipeline.name).glob(f"*/identify*/{REFITS}")
+    files = (root / inputs.loaded.name).glob(f"*/identify*/{REFITS}")
     refits = Refits(folder / REFITS, inputs.digest, sorted(files, key=lambda f: f.stat().st_mtime, reverse=True))
     try:
         yield replace(inputs, refits=refits)
@@ -174,9 +174,9 @@ def storing_refits(inputs: Inputs, folder: Path, root: Path) -> Iterator[Inputs]
         refits.close()
 
 
-def robot_of(pipeline: Pipeline, config: IdentifyConfig) -> RecordedRobot:
-    """Return the pipeline's robot in the configured world, with the optional terms that the configuration names."""
-    return offering(in_world(pipeline.load(), config.world), config.terms)
+def configured(robot: RecordedRobot, config: IdentifyConfig) -> RecordedRobot:
+    """Return a robot in the configured world, with the optional terms that the configuration names."""
+    return offering(in_world(robot, config.world), config.terms)
 
 
 def table_of(model: IdentifiableModel, config: IdentifyConfig, episodes: Sequence[Episode]) -> ParameterTable:

@@ -62,6 +62,7 @@ from sim2real.stages.identify.fitting import (
 )
 from sim2real.stages.identify.inputs import Inputs, table_of, with_load
 from sim2real.stages.identify.true_values import true_values
+from sim2real.stages.load import defaults_of
 from sim2real.stages.shared.identification import offering, split_of, usable, with_wanted_terms
 from sim2real.stages.terminal.console import note, progress, shown
 from sim2real.stages.terminal.interruption import patiently
@@ -118,7 +119,7 @@ def judge(inputs: Inputs, fits: Fits, started_s: float) -> Identification:
         fit = findings.fit
         truth = true_values(inputs.logs[0]) if config.reveal else {}
         posterior = fit.problem.table.posterior(fit.x, findings.spread.scale_covariance)
-        document = _estimates(inputs.pipeline.name, findings, posterior, truth, time.monotonic() - started_s)
+        document = _estimates(inputs.loaded.name, findings, posterior, truth, time.monotonic() - started_s)
         # Predict held-out data, beside baselines.
         bar.set_description_str("identify: predictions and baselines")
         document = patiently(lambda: _predicted(document, inputs, fit))
@@ -137,8 +138,9 @@ def judge(inputs: Inputs, fits: Fits, started_s: float) -> Identification:
         document = with_load(document, inputs.robot, inputs.standing, truth)
     document, outside = _compared(document, inputs, fit, parts)
     names = [n for n in inputs.undetermined if n not in document.values]
-    # A pipeline's own bounds may be widened once.
-    set_by_user = {n for n, both in config.bounds.items() if inputs.pipeline.identify.bounds.get(n) != both}
+    # The robot's own bounds may be widened once.
+    usual = defaults_of(inputs.loaded).identify.bounds
+    set_by_user = {n for n, both in config.bounds.items() if usual.get(n) != both}
     open_ = [f"not determined by this log: {', '.join(names)}"] if names else []
     return _judged(document, findings, inputs, [*outside, *held, *open_], lacks, set_by_user)
 
@@ -430,7 +432,7 @@ def inclined(inputs: Inputs, fit: Fit) -> tuple[float, dict[str, float], str] | 
     """
     config, chosen = inputs.config, fit.problem.table.terms
     wanted = ",".join([*chosen, _TILT])
-    robot = offering(in_world(inputs.pipeline.load(), config.world), wanted)
+    robot = offering(in_world(inputs.loaded, config.world), wanted)
     model, episodes = measured_channels(robot.identifiable(config.max_delay_s), inputs.episodes), inputs.episodes
     turns = [p.name for p in model.parameters if p.term == _TILT]
     if not turns or _TILT in chosen or set(turns) & set(config.fix):
@@ -508,7 +510,7 @@ def _tried(inputs: Inputs, fit: Fit) -> tuple[TriedTerm, ...]:
     The three most promising ones by linear algebra and the limits are fitted, without refits: about as long as the fit.
     """
     config, chosen = inputs.config, fit.problem.table.terms
-    robot = offering(in_world(inputs.pipeline.load(), config.world), ",".join(["auto", *chosen]))
+    robot = offering(in_world(inputs.loaded, config.world), ",".join(["auto", *chosen]))
     model, episodes = measured_channels(robot.identifiable(config.max_delay_s), inputs.episodes), inputs.episodes
     bounded = model.parameters.with_bounds(config.bounds).with_reached(model.reached(episodes[: inputs.fitted]))
     table = with_wanted_terms(bounded, "all").with_fixed(config.fix)
@@ -530,7 +532,7 @@ def _tried(inputs: Inputs, fit: Fit) -> tuple[TriedTerm, ...]:
 def _free_runs_with(inputs: Inputs, wanted: str, term: str) -> Sequence[FreeRun] | None:
     """Return the free runs of the model with further terms; None if the robot has no free parameter of the last one."""
     config = replace(inputs.config, terms=wanted, generations=0)
-    robot = offering(in_world(inputs.pipeline.load(), config.world), wanted)
+    robot = offering(in_world(inputs.loaded, config.world), wanted)
     model, episodes = measured_channels(robot.identifiable(config.max_delay_s), inputs.episodes), inputs.episodes
     if {p.name for p in model.parameters if p.term == term} <= set(config.fix):
         return None
@@ -601,7 +603,7 @@ def _offers_more(inputs: Inputs, fit: Fit) -> bool:
     config = inputs.config
     if config.terms == "auto" or not _has_parts(inputs, fit):
         return False
-    robot = offering(in_world(inputs.pipeline.load(), config.world), "auto")
+    robot = offering(in_world(inputs.loaded, config.world), "auto")
     return bool(
         {p.term for p in robot.identifiable(config.max_delay_s).parameters if p.term} - set(fit.problem.table.terms)
     )

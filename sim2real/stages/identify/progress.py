@@ -109,7 +109,7 @@ class Best:
             for i, value in enumerate(values[p.name])
         ]
         return Identification(
-            pipeline=inputs.pipeline.name,
+            pipeline=inputs.loaded.name,
             logs=inputs.sources(run_dir),
             verdict=Judgement("not finished", (reason,), again),
             parameters=tuple(rows),

@@ -17,19 +17,19 @@ from sim2real.identification.uncertainty import noises
 from sim2real.robots.robot import RecordedRobot, Robot
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.identify.fitting import fit_model
-from sim2real.stages.identify.inputs import Inputs, prepare, robot_of, storing_refits
+from sim2real.stages.identify.inputs import Inputs, configured, prepare, storing_refits
 from sim2real.stages.identify.judgement import judge
 from sim2real.stages.identify.progress import Best, kept
 from sim2real.stages.identify.show import show, summary
+from sim2real.stages.load import AnyRobot, defaults_of, robot_of
 from sim2real.stages.pipeline.open_log import open_recording
-from sim2real.stages.pipeline.pipeline import Pipeline, pipeline_of
 from sim2real.stages.pipeline.python_arguments import AnyRecording, config_of, recordings_of
 from sim2real.stages.shared.identification import command, continuing
 from sim2real.stages.terminal.console import progress, shown
 
 
 def identify(
-    robot: RecordedRobot | Pipeline | str,
+    robot: AnyRobot,
     recording: AnyRecording | Sequence[AnyRecording],
     config: IdentifyConfig | Mapping[str, Any] | None = None,
     hold_out: AnyRecording | Sequence[AnyRecording] = (),
@@ -40,13 +40,13 @@ def identify(
     """Identify a robot's parameters.
 
     Args:
-        robot: The robot, its pipeline, or the pipeline's name.
+        robot: The robot, or the name of its pipeline.
         recording: The recordings to fit: one or several, or the paths of their logs.
-        config: Settings; default: the pipeline's. A dict has the settings that differ from these. The
+        config: Settings; default: the robot's. A dict has the settings that differ from these. The
             files that it may name are not read.
         hold_out: Recordings that are only predicted.
         best: Updated with the best values so far while the search runs.
-        begin: Values at which the search begins; default: the pipeline's.
+        begin: Values at which the search begins; default: the model's.
         standing: The recording of a robot on its feet, from which its load is estimated.
 
     Returns:
@@ -56,12 +56,12 @@ def identify(
         UsageError: When the recordings are too short, or the model does not fit them.
         Sim2RealError: When a recording holds no numbers where the model reads some, or other units.
     """
-    pipeline = pipeline_of(robot)
-    config = config_of(config, pipeline.identify)
-    fitted = recordings_of(recording, pipeline)
-    held_out = recordings_of(hold_out, pipeline, "hold_out") if hold_out else ()
-    stands = recordings_of(standing, pipeline, "standing")[0] if standing is not None else None
-    return _identify(prepare(pipeline, config, fitted, held_out, begin, stands), best or Best())
+    robot = robot_of(robot)
+    config = config_of(config, defaults_of(robot).identify)
+    fitted = recordings_of(recording, robot)
+    held_out = recordings_of(hold_out, robot, "hold_out") if hold_out else ()
+    stands = recordings_of(standing, robot, "standing")[0] if standing is not None else None
+    return _identify(prepare(robot, config, fitted, held_out, begin, stands), best or Best())
 
 
 def _identify(inputs: Inputs, best: Best) -> Identification:
@@ -80,41 +80,41 @@ def _identify(inputs: Inputs, best: Best) -> Identification:
     )
 
 
-def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | None) -> StageFolder:
-    """Identify the pipeline's parameters, in a stage folder.
+def run(robot: RecordedRobot, config: IdentifyConfig, root: Path, run_dir: Path | None) -> StageFolder:
+    """Identify the robot's parameters, in a stage folder.
 
     Args:
         run_dir: Run folder to add to; None takes the one of the log.
     """
-    robot = robot_of(pipeline, config)
-    paths, run_dir = find_logs(pipeline, config, root, run_dir)
+    wanted = configured(robot, config)
+    paths, run_dir = find_logs(robot, config, root, run_dir)
     # Refuse wrong flags, logs that are given twice and logs that are too short before a folder is made.
-    begin = _begin(config.begin, pipeline) if config.begin else None
+    begin = _begin(config.begin, robot) if config.begin else None
     standing = Path(config.standing) if config.standing else None
     with progress(None, "identify: read the logs"):
-        logs = [open_recording(path, pipeline, robot) for path in paths]
+        logs = [open_recording(path, robot) for path in paths]
         fitted = len(logs) - len(config.hold_out)
-        stands = open_recording(standing, pipeline, robot) if standing else None
-        inputs = prepare(pipeline, config, logs[:fitted], logs[fitted:], begin, stands)
+        stands = open_recording(standing, robot) if standing else None
+        inputs = prepare(robot, config, logs[:fitted], logs[fitted:], begin, stands)
     files = {"log" if i == 0 else f"log_{i}": path for i, path in enumerate(paths)}
     files |= {"standing": standing} if standing else {}
     with (
-        open_stage(root, pipeline.name, "identify", config, files, run_dir) as stage,
+        open_stage(root, robot.name, "identify", config, files, run_dir) as stage,
         storing_refits(inputs, stage.folder, root) as inputs,
-        kept(stage, inputs, lambda file: continuing(pipeline, config, root, file)) as best,
+        kept(stage, inputs, lambda file: continuing(robot, config, root, file)) as best,
     ):
         identification = _identify(inputs, best)
         if inputs.refits.stored:
             stage.output("refits", REFITS)
         # Complete the verdict's flags to a command, and name the logs by their paths in the run folder.
         flags = identification.verdict.next
-        again = command(pipeline, config, root, flags) if flags else ""
+        again = command(robot, config, root, flags) if flags else ""
         if identification.verdict.status == "not finished":
-            again = continuing(pipeline, config, root, stage.folder / PARAMETERS)
+            again = continuing(robot, config, root, stage.folder / PARAMETERS)
         verdict = replace(identification.verdict, next=again)
         identification = replace(identification, logs=inputs.sources(stage.run_dir), verdict=verdict)
-        show(identification, _following(pipeline, robot, stage, identification))
-        _write(identification, stage, robot)
+        show(identification, _following(robot, stage, identification))
+        _write(identification, stage, wanted)
         stage.summary(summary(identification))
     return stage.result
 
@@ -127,10 +127,10 @@ def _write(identification: Identification, stage: OpenStage, robot: RecordedRobo
         stage.output("mjcf", "identified.xml").write_text(mjcf, encoding="utf-8")
 
 
-def _following(pipeline: Pipeline, robot: RecordedRobot, stage: OpenStage, identification: Identification) -> str:
+def _following(robot: RecordedRobot, stage: OpenStage, identification: Identification) -> str:
     """Return what to do where the verdict has no next command."""
-    name, folder = pipeline.name, shlex.quote(shown(stage.folder))
-    if not pipeline.has_commands:
+    name, folder = robot.name, shlex.quote(shown(stage.folder))
+    if robot.folder is None:
         return ""
     if identification.verdict.status == "record again":
         return f"sim2real check {name}, which says what motion determines the parameters"
@@ -141,19 +141,19 @@ def _following(pipeline: Pipeline, robot: RecordedRobot, stage: OpenStage, ident
     return f"sim2real validate {folder} --log LATER_LOG, or sim2real export {folder}"
 
 
-def _begin(path: str, pipeline: Pipeline) -> dict[str, float]:
+def _begin(path: str, robot: RecordedRobot) -> dict[str, float]:
     """Return the values at which a search begins, from an earlier identification of the same robot."""
     earlier = Identification.load(Path(path))
-    if earlier.pipeline != pipeline.name:
+    if earlier.pipeline != robot.name:
         raise UsageError(
-            f"{path} is of pipeline {earlier.pipeline!r}, not of {pipeline.name!r}",
+            f"{path} is of pipeline {earlier.pipeline!r}, not of {robot.name!r}",
             hint="begin at an identification of the same robot, or leave --begin out",
         )
     return {p.name: p.estimate for p in earlier.parameters if p.kind != "derived" and p.verdict != "fixed"}
 
 
 def find_logs(
-    pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | None
+    robot: RecordedRobot, config: IdentifyConfig, root: Path, run_dir: Path | None
 ) -> tuple[list[Path], Path | None]:
     """Return the logs to work on, those that are held out last, and the run folder to write into.
 
@@ -164,5 +164,5 @@ def find_logs(
     held_out = [Path(p) for p in config.hold_out]
     if config.log:
         return [Path(p) for p in config.log] + held_out, run_dir
-    recorded = newest(root, pipeline.name, "record", run_dir)
+    recorded = newest(root, robot.name, "record", run_dir)
     return [*recorded.logs(), *held_out], run_dir or recorded.run_dir

@@ -13,7 +13,7 @@ from sim2real.artifacts.timing import Timing
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
 from sim2real.log.importing import importer
-from sim2real.log.importing.mapping import ImportMapping, load_mapping
+from sim2real.log.importing.mapping import MAPPING, ImportMapping, load_mapping
 from sim2real.log.importing.propose import check_mapping, hint_for, propose
 from sim2real.log.importing.readers import Table, joined, open_tables
 from sim2real.log.importing.signals import ImportHints, Proposal
@@ -21,7 +21,7 @@ from sim2real.robots.model.drives import joints_of, slides_of
 from sim2real.robots.model.file import read_model
 from sim2real.robots.model.robot import MjcfRobot
 from sim2real.stages.import_logs.config import ImportConfig
-from sim2real.stages.pipeline import pipeline
+from sim2real.stages.load import folder_of, load_robot
 from sim2real.stages.terminal.console import note, pairs, shown, wrote
 
 
@@ -86,10 +86,8 @@ def configured_mapping(config: ImportConfig) -> ImportMapping | None:
     """Return the mapping of the flag or of the pipeline; None: one is proposed."""
     if config.mapping is not None:
         return load_mapping(config.mapping, config.pipeline)
-    home = pipeline.load_pipeline(config.pipeline) if config.pipeline else None
-    if home is None or not (home.folder / "import.toml").is_file():
-        return None
-    return load_mapping(None, home.name, home.package)
+    file = folder_of(config.pipeline) / MAPPING if config.pipeline else None
+    return load_mapping(file, config.pipeline) if file is not None and file.is_file() else None
 
 
 def hints_of(config: ImportConfig) -> ImportHints:
@@ -100,7 +98,7 @@ def hints_of(config: ImportConfig) -> ImportHints:
         return hints_of_model(config.mjcf, name, config.joints, config.rate_hz, **more)
     if config.pipeline is None:
         return ImportHints("robot", config.rate_hz, config.joints, **more)
-    robot: Any = pipeline.load_pipeline(config.pipeline).load()
+    robot: Any = load_robot(config.pipeline)
     if isinstance(robot, MjcfRobot):
         return hints_of_model(robot.config.model, config.pipeline, robot.config.joints, config.rate_hz, **more)
     joints = tuple(getattr(getattr(robot, "sensor", None), "joints", ()) or (c.label for c in robot.channels))

@@ -8,7 +8,6 @@ from contextlib import suppress
 from pathlib import Path
 
 from sim2real.robots.robot import RecordedRobot, Robot
-from sim2real.stages.pipeline.pipeline import Pipeline, load_pipeline
 from sim2real.stages.terminal.console import note, shown
 from sim2real.types import Json
 from sim2real.view.live.follower import PERIOD_S, Follower
@@ -17,10 +16,8 @@ from sim2real.view.rerun_recording import Scene
 from sim2real.view.rerun_viewer import open_viewer, rerun_module
 
 
-def scene_of(pipeline: Pipeline, robot: RecordedRobot | Robot | None) -> dict[str, Json]:
-    """Return what another process needs to draw a robot; empty if the robot has neither a scene nor a model."""
-    if pipeline.scene and pipeline.has_commands:
-        return {"pipeline": pipeline.name}
+def scene_of(robot: RecordedRobot) -> dict[str, Json]:
+    """Return what another process needs to draw a robot; empty if the robot has no model."""
     if not isinstance(robot, Robot):
         return {}
     columns = {name: fields["position"] for name, fields in robot.sensor.joints.items() if "position" in fields}
@@ -30,9 +27,6 @@ def scene_of(pipeline: Pipeline, robot: RecordedRobot | Robot | None) -> dict[st
 
 def drawn(scene: Mapping[str, Json]) -> Scene | None:
     """Return the scene that ``scene_of`` describes; None without one."""
-    if scene.get("pipeline"):
-        pipeline = load_pipeline(scene["pipeline"])
-        return pipeline.load(pipeline.scene).log_scene if pipeline.scene else None
     return ModelScene(scene["mjcf"], scene["columns"]) if scene.get("mjcf") else None
 
 

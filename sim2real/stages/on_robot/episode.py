@@ -25,7 +25,6 @@ from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.failure import noted
 from sim2real.stages.on_robot.come_to_rest import come_to_rest
 from sim2real.stages.on_robot.open_robot import answer_rows, bus_use, rig_summary
-from sim2real.stages.pipeline.pipeline import Pipeline
 from sim2real.stages.terminal.console import note, progress
 from sim2real.stages.terminal.interruption import interruptible
 
@@ -79,7 +78,6 @@ class Watch:
 
 
 def run_episode(
-    pipeline: Pipeline,
     robot: Robot,
     session: Session,
     nodes: Mapping[str, BaseNode],
@@ -107,7 +105,7 @@ def run_episode(
     state = graph.init(jax.random.key(0) if has_jax() else None, params)
     graph.warmup(state)  # every program is compiled before torque goes on
     # Start the log, and run; an interrupted episode comes to rest before torque goes off.
-    recorder = _recorder(pipeline, robot, graph, state, log, config, session.rig)
+    recorder = _recorder(robot, graph, state, log, config, session.rig)
     watch = Watch(recorder, ACTUATOR, robot.drive.command)
     graph.recorder = watch
     try:
@@ -184,9 +182,7 @@ def _drive(
                 warned = True
 
 
-def _recorder(
-    pipeline: Pipeline, robot: Robot, graph: AsyncGraph, state: GraphState, log: Path, config: Any, rig: Rig
-) -> McapRecorder:
+def _recorder(robot: Robot, graph: AsyncGraph, state: GraphState, log: Path, config: Any, rig: Rig) -> McapRecorder:
     """Return the log's writer, whose metadata describes the session; a dry run comes first."""
     # The graph as the log's metadata describes it.
     topology = {
@@ -203,7 +199,7 @@ def _recorder(
         for name, node in graph.nodes.items()
     }
     metadata = {
-        "pipeline": pipeline.name,
+        "pipeline": robot.name,
         "dry_run": rig.torque_withheld,
         "config": plain(asdict(config)),
         "graph": topology,

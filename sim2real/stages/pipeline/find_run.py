@@ -5,7 +5,7 @@ from pathlib import Path
 
 from sim2real.artifacts.run import STAGES, StageFolder, attempts, finished, run_folders, stage_status, why_stale
 from sim2real.errors import UsageError
-from sim2real.stages.pipeline.pipeline import available
+from sim2real.stages.load import available
 from sim2real.stages.terminal.console import note
 
 

@@ -20,9 +20,8 @@ from sim2real.robots.model.drives import joints_of
 from sim2real.robots.model.file import read_model, read_spec
 from sim2real.robots.model.parameters import ParameterPattern, usual_patterns
 from sim2real.robots.model.robot import COMMANDS, ROBOT_FILE, MjcfRobot, RobotConfig
-from sim2real.stages.config import MODEL_IDENTIFY
+from sim2real.stages.config import MODEL_IDENTIFY, Defaults
 from sim2real.stages.import_logs import stage as import_logs_stage
-from sim2real.stages.pipeline.pipeline import RobotPipeline
 from sim2real.stages.pipeline.robot_flags import RobotFlags
 from sim2real.stages.terminal import console
 from sim2real.stages.terminal.console import note
@@ -50,12 +49,11 @@ class Described:
     robot: RobotConfig
     mapping: ImportMapping | None
 
-    @property
-    def pipeline(self) -> RobotPipeline:
-        """A pipeline without a folder, for Python."""
-        summary = f"{len(self.robot.joints)} joints of {self.robot.model.name}"
+    def made(self) -> MjcfRobot:
+        """Return the robot, without a folder."""
         robot = MjcfRobot(self.robot)
-        return RobotPipeline(self.name, summary, "", identify=MODEL_IDENTIFY, bare_robot=robot, mapping=self.mapping)
+        robot.name, robot.defaults, robot.mapping = self.name, Defaults(identify=MODEL_IDENTIFY), self.mapping
+        return robot
 
 
 def describe_robot(flags: RobotFlags, logs: Sequence[str]) -> Described:

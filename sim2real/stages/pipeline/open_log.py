@@ -9,25 +9,20 @@ from sim2real.log.importing.importer import import_file
 from sim2real.log.schema import unit_of
 from sim2real.robots.loop import ACTUATOR, SENSOR
 from sim2real.robots.robot import RecordedRobot
-from sim2real.stages.pipeline.pipeline import Pipeline
+from sim2real.stages.load import mapping_of
 from sim2real.stages.terminal.console import note
 
 
-def open_recording(path: Path, pipeline: Pipeline, robot: RecordedRobot | None = None) -> Recording:
-    """Read a log of a pipeline; a log that was cut is used as far as it goes.
+def open_recording(path: Path, robot: RecordedRobot) -> Recording:
+    """Read a log of a robot, in its units; a log that was cut is used as far as it goes.
 
-    A file of another recorder is imported in memory, where the pipeline has a mapping for it.
-
-    Args:
-        pipeline: The pipeline that it must be of.
-        robot: Its robot, in whose units the log must be; None: any units.
+    A file of another recorder is imported in memory, if the robot has a mapping for it.
     """
     # A file of another recorder is read by the pipeline's mapping.
-    if (mapping := pipeline.mapping_of(path)) is not None:
+    if (mapping := mapping_of(robot, path)) is not None:
         # A log of this package must be of this pipeline, and complete.
         recording = Recording(path, import_file(path, mapping))
-        if robot is not None:
-            _require_fitting(recording, robot)
+        _require_fitting(recording, robot)
         return recording
     recording = Recording.load(path)
     for warning in recording.warnings:
@@ -35,13 +30,12 @@ def open_recording(path: Path, pipeline: Pipeline, robot: RecordedRobot | None =
     owner = recording.pipeline
     if owner is None:
         raise Sim2RealError(f"{path} has no name of its pipeline: its metadata is damaged", hint="record again")
-    if owner != pipeline.name:
+    if owner != robot.name:
         raise Sim2RealError(
-            f"{path} is a log of pipeline {owner!r}, not of {pipeline.name!r}", hint=f"run `sim2real identify {owner}`"
+            f"{path} is a log of pipeline {owner!r}, not of {robot.name!r}", hint=f"run `sim2real identify {owner}`"
         )
     require_moved(recording.episode, str(path))
-    if robot is not None:
-        _require_fitting(recording, robot)
+    _require_fitting(recording, robot)
     holes = {n: m for n, m in (recording.episode.metadata["log"].get("missing_steps") or {}).items() if m}
     if holes:
         raise Sim2RealError(f"{path} lacks steps of {', '.join(holes)}: a part of it is damaged", hint="record again")

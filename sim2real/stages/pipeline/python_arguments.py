@@ -14,11 +14,8 @@ from sim2real.artifacts.timing import Timing
 from sim2real.errors import UsageError
 from sim2real.robots.robot import RecordedRobot
 from sim2real.stages.pipeline.open_log import open_recording
-from sim2real.stages.pipeline.pipeline import Pipeline
 
 T = TypeVar("T")
-AnyRobot: TypeAlias = RecordedRobot | Pipeline | str
-"""A robot, its pipeline, or the pipeline's name."""
 AnyPath: TypeAlias = str | Path
 AnyRecording: TypeAlias = Recording | AnyPath
 """A recording, its log, or the folder of a record stage."""
@@ -30,12 +27,12 @@ AnyTiming: TypeAlias = Timing | AnyPath
 """A timing, or its file."""
 
 
-def recording_of(value: Any, pipeline: Pipeline, name: str = "recording") -> Recording:
-    """Return a recording of a pipeline.
+def recording_of(value: Any, robot: RecordedRobot, name: str = "recording") -> Recording:
+    """Return a recording of a robot.
 
     Args:
         value: A recording, a log, or the folder of a record stage.
-        pipeline: The robot that a file must be of.
+        robot: The robot that a file must be of.
 
     Raises:
         UsageError: It is something else.
@@ -44,19 +41,19 @@ def recording_of(value: Any, pipeline: Pipeline, name: str = "recording") -> Rec
     if isinstance(value, Recording):
         return value
     if isinstance(value, str | PathLike):
-        return open_recording(Path(value), pipeline)
+        return open_recording(Path(value), robot)
     raise wrong(value, name, "a Recording, or the path of its log", "sim2real.Recording.load(PATH) opens one")
 
 
-def recordings_of(value: Any, pipeline: Pipeline, name: str = "recording") -> list[Recording]:
-    """Return recordings of a pipeline, from one or several; see ``recording_of``.
+def recordings_of(value: Any, robot: RecordedRobot, name: str = "recording") -> list[Recording]:
+    """Return recordings of a robot, from one or several; see ``recording_of``.
 
     Args:
         value: One recording, or several.
-        pipeline: The robot that files must be of.
+        robot: The robot that files must be of.
     """
     several = isinstance(value, Iterable) and not isinstance(value, Recording | str | Mapping)
-    recordings = [recording_of(one, pipeline, name) for one in (value if several else [value])]
+    recordings = [recording_of(one, robot, name) for one in (value if several else [value])]
     if not recordings:
         raise UsageError(f"{name} is empty: at least one recording is needed")
     return recordings

@@ -38,7 +38,7 @@ def show_open(checked: Checked) -> None:
         note(f"- {message}")
 
 
-def show_by_hand(recording: Recording, robot: Robot, pipeline: str) -> None:
+def show_by_hand(recording: Recording, robot: Robot) -> None:
     """Print how far each joint was moved by hand, and the command that plays the motion."""
     outputs, rows = recording.episode.outputs[SENSOR], []
     for channel in robot.sensor.channels:
@@ -47,5 +47,5 @@ def show_by_hand(recording: Recording, robot: Robot, pipeline: str) -> None:
     print(table(rows, ["joint", "lowest [rad]", "highest [rad]", "moved by [rad]"]))
     note(
         "torque was off and the torque of the hand is not measured, so this log determines no parameter\n"
-        f"next: sim2real record {pipeline} --excitation {shown(recording.path)}"
+        f"next: sim2real record {robot.name} --excitation {shown(recording.path)}"
     )

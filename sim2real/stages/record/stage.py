@@ -11,15 +11,14 @@ import numpy as np
 from sim2real.artifacts.recording import LOG, TRUTH, Recording
 from sim2real.artifacts.run import StageFolder, open_stage
 from sim2real.installation import has_jax
-from sim2real.robots.robot import Robot
+from sim2real.robots.robot import RecordedRobot, Robot
 from sim2real.stages.check.config import CheckConfig
 from sim2real.stages.excitation.played import played
 from sim2real.stages.live.scene import scene_of
 from sim2real.stages.live.viewer import live_view
+from sim2real.stages.load import AnyRobot, defaults_of, moving, robot_of
 from sim2real.stages.on_robot.episode import check_deadlines, run_episode
 from sim2real.stages.on_robot.open_robot import opened
-from sim2real.stages.pipeline.load_robot import moving_robot
-from sim2real.stages.pipeline.pipeline import Pipeline, pipeline_of
 from sim2real.stages.pipeline.python_arguments import AnyPath, config_of, folder_of
 from sim2real.stages.record.config import RecordConfig
 from sim2real.stages.record.show import show, show_by_hand, show_open
@@ -27,15 +26,13 @@ from sim2real.stages.terminal.console import note
 from sim2real.types import Json
 
 
-def record(
-    robot: Robot | Pipeline | str, folder: AnyPath, config: RecordConfig | Mapping[str, Json] | None = None
-) -> Recording:
+def record(robot: AnyRobot, folder: AnyPath, config: RecordConfig | Mapping[str, Json] | None = None) -> Recording:
     """Play the excitation on the robot and record it.
 
     Args:
-        robot: The robot, its pipeline, or the pipeline's name.
+        robot: The robot, or the name of its pipeline.
         folder: Folder for the log; a log is never overwritten.
-        config: Settings; default: those of the robot's pipeline. A dict has the settings that differ from these.
+        config: Settings; default: those of the robot. A dict has the settings that differ from these.
 
     Returns:
         The recording; its ``summary`` is that of the session.
@@ -43,58 +40,57 @@ def record(
     Raises:
         Sim2RealError: The robot was stopped; the log holds everything up to then.
     """
-    pipeline, folder = pipeline_of(robot), folder_of(folder)
-    config = config_of(config, pipeline.record)
-    robot = moving_robot(pipeline)
+    robot, folder = moving(robot_of(robot)), folder_of(folder)
+    config = config_of(config, defaults_of(robot).record)
     log, truth = folder / LOG, folder / TRUTH
-    scene = partial(scene_of, pipeline, robot)
-    signal = None if config.by_hand else _planned(config, pipeline, robot)
+    scene = partial(scene_of, robot)
+    signal = None if config.by_hand else _planned(config, robot)
     duration_s = config.duration_s if signal is None else len(signal) / robot.rate_hz
     note(f"recording {duration_s:g} s of {config.excitation} on {config.port}")
-    with live_view(config.view, folder, pipeline.name, scene), opened(robot, config, truth) as session:
+    with live_view(config.view, folder, robot.name, scene), opened(robot, config, truth) as session:
         if signal is None:
             session.rig.withhold_torque()
             note("torque is off: move the robot by hand", urgent=True)
         nodes = robot.recording_nodes(session, signal, config.standing)
-        run_episode(pipeline, robot, session, nodes, {}, log, duration_s, config, "record")
+        run_episode(robot, session, nodes, {}, log, duration_s, config, "record")
     return Recording.load(log, truth)
 
 
-def _planned(config: RecordConfig, pipeline: Pipeline, robot: Robot) -> np.ndarray:
+def _planned(config: RecordConfig, robot: Robot) -> np.ndarray:
     """Return the commands to play; of a motion from a file, print first what its recording cannot determine."""
-    signal = played(config, pipeline, robot, announce=True)
+    signal = played(config, robot, announce=True)
     if config.motion is None or config.dry_run:
         return signal
     if has_jax():
         from sim2real.stages.check.stage import check  # JAX programs take seconds to compile
 
-        show_open(check(pipeline, None, CheckConfig(plan=True, record=config)))
+        show_open(check(robot, None, CheckConfig(plan=True, record=config)))
     else:
         note("which parameters this motion determines is not checked: JAX is not installed here")
     return signal
 
 
-def run(pipeline: Pipeline, config: RecordConfig, root: Path, run_dir: Path | None) -> StageFolder:
+def run(robot: RecordedRobot, config: RecordConfig, root: Path, run_dir: Path | None) -> StageFolder:
     """Record in a stage folder.
 
     Args:
         run_dir: Run folder to add to; None: a new one.
     """
     # Refuse an excitation that the robot cannot play, before a folder is made.
-    robot = moving_robot(pipeline)
+    robot = moving(robot)
     if not config.by_hand:
-        played(config, pipeline, robot)
-    with open_stage(root, pipeline.name, "record", config, {}, run_dir, config.dry_run or config.by_hand) as stage:
+        played(config, robot)
+    with open_stage(root, robot.name, "record", config, {}, run_dir, config.dry_run or config.by_hand) as stage:
         stage.output("log", LOG)
         if config.port == "embedded":
             stage.output("truth", TRUTH)
-        recording = record(pipeline, stage.folder, config)
+        recording = record(robot, stage.folder, config)
         summary = recording.summary
         for name, path in recording.timing.save(stage.folder).items():
             stage.output(name, path)
         show(summary, config.dry_run)
         if config.by_hand:
-            show_by_hand(recording, robot, pipeline.name)
+            show_by_hand(recording, robot)
         stage.summary(
             {
                 "seconds": config.duration_s,

@@ -24,7 +24,7 @@ from sim2real.identification.parameters import ParameterTable
 from sim2real.identification.segments import GRID_S, Span, on_grid
 from sim2real.robots.robot import RecordedRobot, in_world
 from sim2real.stages.identify.config import IdentifyConfig
-from sim2real.stages.pipeline.pipeline import Pipeline
+from sim2real.stages.load import defaults_of
 from sim2real.stages.terminal.console import note
 
 _ANY_DELAY_S = 0.1
@@ -71,13 +71,13 @@ def offering(robot: RecordedRobot, wanted: str) -> RecordedRobot:
     return robot if wanted in ("own", "none") else robot.with_optional_terms(wanted)
 
 
-def identified_robot(identification: Identification, pipeline: Pipeline) -> tuple[RecordedRobot, IdentifyConfig]:
+def identified_robot(identification: Identification, robot: RecordedRobot) -> tuple[RecordedRobot, IdentifyConfig]:
     """Return the robot in the world of an identification, with its terms, and settings with its longest delay.
 
     Raises:
         UsageError: Its world is not installed.
     """
-    robot = in_world(pipeline.load(), identification.world)
+    robot = in_world(robot, identification.world)
     present, offered = (
         {p.name: p.term for p in r.identifiable(_ANY_DELAY_S).parameters} for r in (robot, offering(robot, "all"))
     )
@@ -88,8 +88,8 @@ def identified_robot(identification: Identification, pipeline: Pipeline) -> tupl
     highs = {p.name: p.high for p in robot.identifiable(1.0).parameters if p.kind == "delay"}
     uppers = {p.name: p.upper for p in identification.parameters if p.kind == "delay" and p.verdict != "fixed"}
     needed_s = [u / highs[n] for n, u in uppers.items() if u is not None and n in highs]
-    longest_s = max([pipeline.identify.max_delay_s, *needed_s])
-    return robot, replace(pipeline.identify, settle_s=identification.settle_s, max_delay_s=longest_s)
+    longest_s = max([defaults_of(robot).identify.max_delay_s, *needed_s])
+    return robot, replace(defaults_of(robot).identify, settle_s=identification.settle_s, max_delay_s=longest_s)
 
 
 # The segments of logs.
@@ -284,19 +284,19 @@ def _contains(read: np.ndarray, piece: np.ndarray) -> bool:
 # The command that identifies again.
 
 
-def command(pipeline: Pipeline, config: IdentifyConfig, root: Path, flags: str = "") -> str:
+def command(robot: RecordedRobot, config: IdentifyConfig, root: Path, flags: str = "") -> str:
     """Return the command of an identification.
 
     Args:
-        pipeline: The robot; settings that equal its defaults need no flag.
+        robot: The robot; settings that equal its defaults need no flag.
         flags: Further flags; they replace those of the settings, bounds and fixed values parameter by parameter.
     """
     further = shlex.split(flags)
-    if not pipeline.has_commands:
+    if robot.folder is None:
         call = "sim2real.identify(robot, recording, ...)"
         return f"{call} with the settings {flags}" if flags else call
     named = {name for flag, name in pairwise(further) if flag in ("--bounds", "--fix")}
-    words = ["sim2real", "identify", pipeline.name]
+    words = ["sim2real", "identify", robot.name]
     # Add a flag for each setting that differs from the pipeline's default.
     for f in fields(config):
         flag, value = "--" + f.name.replace("_", "-"), getattr(config, f.name)
@@ -306,7 +306,7 @@ def command(pipeline: Pipeline, config: IdentifyConfig, root: Path, flags: str =
                 words += [] if name in named else [flag, name, *map(_exactly, values)]
         elif isinstance(value, tuple):
             words += [word for file in value for word in (flag, str(file))]
-        elif value != getattr(pipeline.identify, f.name) and flag not in further:
+        elif value != getattr(defaults_of(robot).identify, f.name) and flag not in further:
             words += (
                 [flag if value else flag.replace("--", "--no-", 1)] if isinstance(value, bool) else [flag, str(value)]
             )
@@ -319,10 +319,10 @@ def _exactly(value: float) -> str:
     return short if float(short := f"{value:g}") == value else repr(value)
 
 
-def continuing(pipeline: Pipeline, config: IdentifyConfig, root: Path, file: Path) -> str:
+def continuing(robot: RecordedRobot, config: IdentifyConfig, root: Path, file: Path) -> str:
     """Return the command that continues an identification that was interrupted or did not converge."""
-    usual = pipeline.identify
+    usual = defaults_of(robot).identify
     generations = max(config.generations, usual.generations)
     steps = max(2 * config.refine_steps, usual.refine_steps)
     flags = f"--begin {shlex.quote(str(file))} --generations {generations} --refine-steps {steps}"
-    return command(pipeline, config, root, flags)
+    return command(robot, config, root, flags)

@@ -10,10 +10,10 @@ from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run import newest, sha256
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import Sim2RealError, UsageError
+from sim2real.robots.robot import RecordedRobot
+from sim2real.stages.load import moving
 from sim2real.stages.pipeline.find_run import warn_of_stale
-from sim2real.stages.pipeline.load_robot import moving_robot
 from sim2real.stages.pipeline.open_parameters import check_parameters, open_identification
-from sim2real.stages.pipeline.pipeline import Pipeline
 from sim2real.stages.terminal.console import note
 from sim2real.stages.train.config import TrainConfig
 from sim2real.stages.train.resume import CHECKPOINT, check_same_parameters, find_interrupted
@@ -43,26 +43,26 @@ class TrainInputs:
         return replace(bundle, contract=replace(bundle.contract, hashes=hashes))
 
 
-def find_inputs(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | None) -> TrainInputs:
+def find_inputs(robot: RecordedRobot, config: TrainConfig, root: Path, run_dir: Path | None) -> TrainInputs:
     """Find and check the inputs that the configuration names; writes no file.
 
     Args:
         run_dir: Run folder to add to; None: that of the parameters, or a new one for the nominal model.
     """
-    moving_robot(pipeline)
-    interrupted = find_interrupted(pipeline.name, config, root)
+    moving(robot)
+    interrupted = find_interrupted(robot.name, config, root)
     run_dir = run_dir if interrupted is None else interrupted.run_dir
-    path, run_dir = find_parameters(pipeline, config, root, run_dir)
+    path, run_dir = find_parameters(robot, config, root, run_dir)
     if interrupted is not None:
         check_same_parameters(interrupted, path)
-    identification = _open_identification(pipeline, config, path)
+    identification = _open_identification(robot, config, path)
     files = {} if path is None else {"parameters": path}
     resume = None if interrupted is None else interrupted.folder / CHECKPOINT
     return TrainInputs(identification, resume, files, run_dir)
 
 
 def find_parameters(
-    pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | None
+    robot: RecordedRobot, config: TrainConfig, root: Path, run_dir: Path | None
 ) -> tuple[Path | None, Path | None]:
     """Return the identification to train on, None for the nominal model, and the run folder to write into.
 
@@ -73,7 +73,7 @@ def find_parameters(
         return None, run_dir
     if config.parameters is not None:
         return Path(config.parameters), run_dir
-    identified = warn_of_stale(newest(root, pipeline.name, "identify", run_dir))
+    identified = warn_of_stale(newest(root, robot.name, "identify", run_dir))
     return identified.output("parameters"), run_dir or identified.run_dir
 
 
@@ -89,11 +89,11 @@ def load_recording(identification: Identification | None, run_dir: Path) -> Reco
         return None
 
 
-def _open_identification(pipeline: Pipeline, config: TrainConfig, path: Path | None) -> Identification | None:
+def _open_identification(robot: RecordedRobot, config: TrainConfig, path: Path | None) -> Identification | None:
     """Return the identification at a path, checked for training; None for the nominal model."""
     if path is None:
         return None
-    identification = open_identification(path, pipeline)
+    identification = open_identification(path, robot)
     timing_of(identification)
     require_accepted(identification, config)
     if identification.verdict.status != "accepted":
@@ -102,14 +102,14 @@ def _open_identification(pipeline: Pipeline, config: TrainConfig, path: Path | N
 
 
 def check_identification(
-    pipeline: Pipeline, config: TrainConfig, identification: Identification | None
+    robot: RecordedRobot, config: TrainConfig, identification: Identification | None
 ) -> Identification | None:
     """Return an identification that may be trained on; None for the nominal model."""
     if config.model == "nominal":
         return None
     if identification is None:
         raise UsageError("training on the identified model needs an identification", hint="--model nominal needs none")
-    check_parameters(identification, pipeline)
+    check_parameters(identification, robot)
     require_accepted(identification, config)
     return identification
 

@@ -16,7 +16,6 @@ from sim2real.errors import UsageError
 from sim2real.identification.rollouts import Program
 from sim2real.robots.loop import DELAYS, LoopTask, split_delay
 from sim2real.robots.robot import Robot
-from sim2real.stages.pipeline.pipeline import Pipeline
 from sim2real.stages.train.config import TrainConfig
 from sim2real.stages.train.training_setup import prepare
 from sim2real.training.config import PPOConfig
@@ -33,11 +32,10 @@ _EPISODES = 16
 
 
 def policy_sensitivity(
-    pipeline: Pipeline,
+    robot: Robot,
     config: TrainConfig,
     identification: Identification | None,
     timing: Timing | None,
-    robot: Robot,
     policy: Policy,
 ) -> Sensitivity | None:
     """Return the success of the policy with each parameter moved; None without intervals of the parameters."""
@@ -45,9 +43,8 @@ def policy_sensitivity(
         return None
     moves = moves_of(identification)
     models = models_of(identification.values, moves)
-    wide = with_room(robot, models)
-    env = prepare(pipeline, replace(config, timelines=TIMELINES), identification, timing, robot=wide).env
-    return sensitivity(wide, env, policy, moves, models, config.seed)
+    setup = prepare(with_room(robot, models), replace(config, timelines=TIMELINES), identification, timing)
+    return sensitivity(setup.robot, setup.env, policy, moves, models, config.seed)
 
 
 @dataclass(frozen=True)

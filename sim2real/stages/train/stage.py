@@ -12,9 +12,9 @@ import jax
 from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.run import StageFolder, open_stage
-from sim2real.robots.robot import Robot
+from sim2real.robots.robot import RecordedRobot
+from sim2real.stages.load import AnyRobot, defaults_of, moving, robot_of
 from sim2real.stages.pipeline import python_arguments
-from sim2real.stages.pipeline.pipeline import Pipeline, pipeline_of
 from sim2real.stages.pipeline.python_arguments import (
     AnyIdentification,
     AnyPath,
@@ -41,7 +41,7 @@ from sim2real.types import Json
 
 
 def train(
-    robot: Robot | Pipeline | str,
+    robot: AnyRobot,
     identification: AnyIdentification | None = None,
     config: TrainConfig | Mapping[str, Json] | None = None,
     timing: AnyTiming | None = None,
@@ -53,9 +53,9 @@ def train(
     """Train a policy.
 
     Args:
-        robot: The robot, its pipeline, or the pipeline's name.
+        robot: The robot, or the name of its pipeline.
         identification: An identification, or its folder; the nominal model needs none.
-        config: Settings; default: those of the robot's pipeline. A dict has the settings that differ from these. The
+        config: Settings; default: those of the robot. A dict has the settings that differ from these. The
             function does not read the files that it names.
         timing: The robot's timing; default: that of the identification's recording. The nominal model has no delays.
         checkpoint: File that receives the whole training after each evaluation; None: none is written.
@@ -72,18 +72,18 @@ def train(
     # Turn names, folders and dicts into objects.
     if isinstance(identification, TrainConfig):  # the order of earlier versions
         identification, config = cast("AnyIdentification | None", config), identification
-    pipeline = pipeline_of(robot)
-    config = config_of(config, pipeline.train)
+    robot = moving(robot_of(robot))
+    config = config_of(config, defaults_of(robot).train)
     identification = None if identification is None else identification_of(identification)
     timing = None if timing is None else python_arguments.timing_of(timing)
-    recording = None if log is None else recording_of(log, pipeline, "log")
+    recording = None if log is None else recording_of(log, robot, "log")
 
     # Draw the episodes.
     with progress(None, "train: draw episodes", leads()):
-        setup = prepare(pipeline, config, identification, timing)
+        setup = prepare(robot, config, identification, timing)
     contract = contract_of(setup.robot, setup.env.task, setup.values, setup.episodes)
     port = "" if recording is None else str(recording.episode.metadata.get("port", ""))
-    contract = replace(contract, robot=pipeline.name if pipeline.has_commands else "", port=port)
+    contract = replace(contract, robot=robot.name if robot.folder is not None else "", port=port)
 
     # Train.
     write, read = (None if path is None else Path(path) for path in (checkpoint, resume))
@@ -93,11 +93,11 @@ def train(
     weakness = None
     if config.sensitivity and leads():
         with progress(None, "train: sensitivity of the policy"):
-            weakness = policy_sensitivity(pipeline, config, identification, timing, setup.robot, result.best)
+            weakness = policy_sensitivity(robot, config, identification, timing, result.best)
     return bundle_of_training(setup, config, contract, result, weakness, recording)
 
 
-def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | None) -> StageFolder | None:
+def run(robot: RecordedRobot, config: TrainConfig, root: Path, run_dir: Path | None) -> StageFolder | None:
     """Train, and write the policy bundle into a stage folder; of several processes the first one writes.
 
     Args:
@@ -112,23 +112,23 @@ def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | Non
     join(config.hosts)
 
     # Find and check the inputs, before a folder is made.
-    inputs = find_inputs(pipeline, config, root, run_dir)
+    inputs = find_inputs(robot, config, root, run_dir)
     identification, resume = inputs.identification, inputs.resume
     if config.explain:
-        return _explain(pipeline, config, identification, inputs.files, root, inputs.run_dir)
+        return _explain(robot, config, identification, inputs.files, root, inputs.run_dir)
 
     # Wait for all processes: the first one's new folder must not be an input of a slower one.
     with lost_process_errors():
         wait_for_all("all processes have read their inputs")
     if not leads():
-        train(pipeline, identification, config, checkpoint=Path(CHECKPOINT), resume=resume)
+        train(robot, identification, config, checkpoint=Path(CHECKPOINT), resume=resume)
         return None
 
     # Train, write the bundle, and print.
-    with open_stage(root, pipeline.name, "train", config, inputs.files, inputs.run_dir) as stage:
+    with open_stage(root, robot.name, "train", config, inputs.files, inputs.run_dir) as stage:
         with resumable(stage.folder) as checkpoint, watching(stage, config) as watch:
             file, log = checkpoint if config.checkpoint else None, load_recording(identification, stage.run_dir)
-            bundle = train(pipeline, identification, config, None, file, resume, watch, log)
+            bundle = train(robot, identification, config, None, file, resume, watch, log)
         bundle = inputs.with_hashes(bundle)
         for name, saved in bundle.save(stage.folder).items():
             stage.output(name, saved)
@@ -154,7 +154,7 @@ def _learn(
 
 
 def _explain(
-    pipeline: Pipeline,
+    robot: RecordedRobot,
     config: TrainConfig,
     identification: Identification | None,
     inputs: Mapping[str, Path],
@@ -167,8 +167,8 @@ def _explain(
         identification: None: the nominal model.
         run_dir: Run folder to add to; None: a new one.
     """
-    with open_stage(root, pipeline.name, "explain", config, inputs, run_dir) as stage:
-        episodes = prepare(pipeline, config, identification).episodes
+    with open_stage(root, robot.name, "explain", config, inputs, run_dir) as stage:
+        episodes = prepare(robot, config, identification).episodes
         for name, file in episodes.save(stage.folder).items():
             stage.output(name, file)
         from sim2real.view.episodes import picture  # matplotlib takes 0.5 s to import

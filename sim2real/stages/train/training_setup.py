@@ -10,10 +10,9 @@ from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import UsageError
 from sim2real.robots.loop import AGENT, DELAYS, SENSOR, WORLD
-from sim2real.robots.robot import Robot
+from sim2real.robots.robot import RecordedRobot, Robot
 from sim2real.runtime.compiled.graph import CompiledGraph
-from sim2real.stages.pipeline.load_robot import moving_robot
-from sim2real.stages.pipeline.pipeline import Pipeline
+from sim2real.stages.load import defaults_of, moving
 from sim2real.stages.train.config import TrainConfig
 from sim2real.stages.train.episode_variation import episodes_of, set_noise, set_start, with_disturbances
 from sim2real.stages.train.inputs import check_identification, timing_of, world_of
@@ -39,25 +38,23 @@ class TrainingSetup:
 
 
 def prepare(
-    pipeline: Pipeline,
+    robot: RecordedRobot,
     config: TrainConfig,
     identification: Identification | None = None,
     timing: Timing | None = None,
     changed: Mapping[str, float] | None = None,
-    robot: Robot | None = None,
 ) -> TrainingSetup:
     """Make the environment.
 
     Args:
         timing: The robot's timing; default: that of the identification's recording. The nominal model has no delays.
         changed: Parameters with other values than the model's; the nominal model has delays if both are among them.
-        robot: The pipeline's robot in its world, changed by the caller; default: unchanged.
 
     Raises:
         Sim2RealError: The identification is of another robot or was not accepted, or its timing is unusable.
     """
-    identification = check_identification(pipeline, config, identification)
-    robot = robot or moving_robot(pipeline, world_of(config, identification))
+    identification = check_identification(robot, config, identification)
+    robot = moving(robot, world_of(config, identification))
 
     # Draw parameters and delays.
     has_posterior = identification is not None and identification.posterior is not None
@@ -66,7 +63,8 @@ def prepare(
         robot.nominal() if identified is None else robot.model.unidentified() | identified, changed or {}
     )
     rng = np.random.default_rng(config.seed)
-    vary = config.vary if identified is None else without_default_ranges(config.vary, pipeline.train.vary, identified)
+    vary, usual = config.vary, defaults_of(robot).train.vary
+    vary = vary if identified is None else without_default_ranges(vary, usual, identified)
     draws = draw_robots(values, identification, vary, config.randomise, rng)
     draws = {n: d for n, d in draws.items() if n not in (changed or ())}
 

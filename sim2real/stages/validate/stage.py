@@ -31,12 +31,12 @@ from sim2real.identification.predictions import Position, positions
 from sim2real.identification.problem import Problem
 from sim2real.identification.segments import Span, check_log, ranges
 from sim2real.identification.verdict import ACCEPTED, scores
-from sim2real.robots.robot import Robot
+from sim2real.robots.robot import RecordedRobot, Robot
 from sim2real.stages.identify.config import IdentifyConfig
+from sim2real.stages.load import AnyRobot, defaults_of, load_robot, robot_of
 from sim2real.stages.pipeline import python_arguments
 from sim2real.stages.pipeline.open_log import open_recording
-from sim2real.stages.pipeline.pipeline import Pipeline, load_pipeline, pipeline_of
-from sim2real.stages.pipeline.python_arguments import AnyIdentification, AnyRecording, AnyRobot
+from sim2real.stages.pipeline.python_arguments import AnyIdentification, AnyRecording
 from sim2real.stages.shared.identification import command, identified_robot, require_new, side_by_side, usable
 from sim2real.stages.terminal.console import artifact_table, note, progress, shown
 from sim2real.stages.validate.config import ValidateConfig
@@ -131,24 +131,24 @@ def run(config: ValidateConfig) -> bool:
             "validate needs parameters and a log", hint="sim2real validate RUN/identify/parameters.json --log new.mcap"
         )
     identification = Identification.load(config.parameters)
-    pipeline = load_pipeline(identification.pipeline)
+    robot = load_robot(identification.pipeline)
     # A log that cannot be read is named, and the others are scored.
     logs, refused = [], dict[str, str]()
     for path in config.log:
         try:
-            logs.append(open_recording(Path(path), pipeline))
+            logs.append(open_recording(Path(path), robot))
         except Sim2RealError as error:
             if len(config.log) == 1:
                 raise
             refused[path] = str(error)
-    found = score(identification, pipeline, logs, config, refused)
+    found = score(identification, robot, logs, config, refused)
     if config.json:
         rows = [{**plain(e), "ratio": e.ratio, "exceeded": e.exceeded} for e in found.errors]
         document = {**plain(found), "errors": rows, "verdict": found.verdict, "holds": found.holds}
         print(to_json(document).decode())
         return found.holds
     note(f"verdict: {found.verdict}")
-    note(f"next: {_following(found, identification, pipeline, config)}")
+    note(f"next: {_following(found, identification, robot, config)}")
     print(artifact_table(found.rows(), _SHOWN))
     for log, joints in (found.resting or {}).items():
         note(f"{', '.join(joints)} does not move in {log}, which tests nothing about it")
@@ -159,7 +159,7 @@ def run(config: ValidateConfig) -> bool:
     return found.holds
 
 
-def _following(found: Validation, identification: Identification, pipeline: Pipeline, config: ValidateConfig) -> str:
+def _following(found: Validation, identification: Identification, robot: RecordedRobot, config: ValidateConfig) -> str:
     """Return the next command, or what to do where none follows."""
     folder = Path(config.parameters or "")
     folder = folder if folder.is_dir() else folder.parent
@@ -167,14 +167,14 @@ def _following(found: Validation, identification: Identification, pipeline: Pipe
         # An identification from all logs covers the motion of the new ones.
         fitted = [os.path.relpath(folder.parent / source.path) for source in identification.logs]
         logs = tuple(dict.fromkeys([*fitted, *config.log]))
-        again = command(pipeline, replace(pipeline.identify, log=logs), Path("runs"))
+        again = command(robot, replace(defaults_of(robot).identify, log=logs), Path("runs"))
         return f"if the robot is still the same, identify from all of these logs: {again}"
     if found.identified != ACCEPTED:
         return identification.verdict.next or "identify again: this identification was not accepted"
     if found.refused:
         return "mend the logs that were not scored, or leave them out"
-    if isinstance(pipeline.load(), Robot):
-        return f"sim2real train {pipeline.name} --run {shlex.quote(shown(folder.parent))}"
+    if isinstance(robot, Robot):
+        return f"sim2real train {robot.name} --run {shlex.quote(shown(folder.parent))}"
     return f"sim2real export {shlex.quote(shown(folder))}"
 
 
@@ -187,22 +187,22 @@ def validate(
     """Score an identification on later recordings.
 
     Args:
-        robot: The robot, its pipeline, or the pipeline's name.
+        robot: The robot, or the name of its pipeline.
         identification: The identification, or its folder.
         recording: One recording that was not fitted, or several; or the paths of their logs.
         config: A dict holds the fields that differ from the default.
     """
-    pipeline = pipeline_of(robot)
+    robot = robot_of(robot)
     document = python_arguments.identification_of(identification)
-    if document.pipeline != pipeline.name:
-        raise UsageError(f"these are parameters of pipeline {document.pipeline!r}, not of {pipeline.name!r}")
-    logs = python_arguments.recordings_of(recording, pipeline)
-    return score(document, pipeline, logs, python_arguments.config_of(config, ValidateConfig()))
+    if document.pipeline != robot.name:
+        raise UsageError(f"these are parameters of pipeline {document.pipeline!r}, not of {robot.name!r}")
+    logs = python_arguments.recordings_of(recording, robot)
+    return score(document, robot, logs, python_arguments.config_of(config, ValidateConfig()))
 
 
 def score(
     identification: Identification,
-    pipeline: Pipeline,
+    robot: RecordedRobot,
     logs: Sequence[Recording],
     config: ValidateConfig,
     refused: Mapping[str, str] | None = None,
@@ -215,7 +215,7 @@ def score(
     Raises:
         UsageError: A log was fitted, no log can be scored, or each recording has its own parameters.
     """
-    robot, fitting = identified_robot(identification, pipeline)
+    robot, fitting = identified_robot(identification, robot)
     model = measured_channels(robot.identifiable(fitting.max_delay_s), [log.episode for log in logs])
     models = models_of(identification, model)
     refused = dict(refused or {})
@@ -274,7 +274,7 @@ def score(
     ordered = tuple(sorted(errors, key=lambda e: -(e.ratio or 0.0)))
     resting = {log: joints for log, joints in resting.items() if joints}
     status = identification.verdict.status
-    return Validation(pipeline.name, horizon_s, ordered, status, resting, refused, fitted)
+    return Validation(robot.name, horizon_s, ordered, status, resting, refused, fitted)
 
 
 def models_of(identification: Identification, model: IdentifiableModel) -> dict[str, dict[str, float]]:
