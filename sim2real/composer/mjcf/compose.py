@@ -8,6 +8,7 @@ of an attached model ``model/``.
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 _COSMETIC = ("material", "texture")
 """Attributes that an element can do without: they may name something that was removed."""
 _ANGLES = ("range", "ref", "springref")
+_SPECIAL = re.compile('[&<>"\n\r\t]').search
 _FOLDERS = ("meshdir", "texturedir", "assetdir")
 
 
@@ -36,8 +38,17 @@ def compile_model(model: RootElement) -> MjModel:
 
 
 def text(model: RootElement, precision: int = 17) -> str:
-    """Return a model as MJCF."""
-    return _Writer(model, precision=precision).document()
+    """Return a model as MJCF; what was written last, where nothing has changed since."""
+    models = [(one, one.changes) for one in model.all_models()]
+    if model.written is not None:
+        before, arrays, numbers, document = model.written
+        if before == (models, precision) and [a.tobytes() for a in arrays] == numbers:
+            return document
+    writer = _Writer(model, precision=precision)
+    document = writer.document()
+    numbers = [a.tobytes() for a in writer.arrays]  # a program may write into the array of an attribute
+    object.__setattr__(model, "written", ((models, precision), writer.arrays, numbers, document))
+    return document
 
 
 def element_text(element: Element, top: RootElement, self_only: bool, pretty: bool, precision: int) -> str:
@@ -84,9 +95,12 @@ class _Writer:
     def __init__(self, top: RootElement, world: RootElement | None = None, precision: int = 17) -> None:
         self.top, self.world, self._number = top, world or top, f"%.{precision}g"
         self.lines: list[str] = []
+        self.arrays: list[np.ndarray] = []
         self._is_whole = False
         self._unnamed: dict[RootElement, dict[Element, int]] = {}
         self._factors: dict[RootElement, float] = {}
+        self._prefixes: dict[RootElement, str] = {}
+        self._classed: dict[Element, str | None] = {}
 
     # -- documents
 
@@ -107,7 +121,7 @@ class _Writer:
                     for child in children:
                         self.element(child, 2)
                     self.lines.append(f"  </{tag}>")
-        keys = top.find_all("key")
+        keys = top._child("keyframe")._with_attached()
         if keys:
             body = "\n".join(self.lines)
             self.lines.append("  <keyframe>")
@@ -189,7 +203,7 @@ class _Writer:
             if not made[named_by]:  # a composite at the top, whose elements are called as MuJoCo calls them
                 del made[named_by]
         if "class" in spec.attributes and "class" not in given and element._tag != "default":
-            by_model = self._class(element)
+            by_model = self._class(element._parent or element)
             if by_model:
                 made["class"] = by_model
         for name in sorted(given, key=spec.attributes.__getitem__):
@@ -199,7 +213,7 @@ class _Writer:
             written = self._text(element, name, value)
             if written is not None:
                 made[name] = written
-        if "name" in made and (element.is_frame or element._parent.is_frame):
+        if "name" in made and (element._attached is not None or element._parent._attached is not None):
             made["name"] = made.pop("name")  # PyMJCF writes it last
         factor = self._factor(element.root)
         if factor != 1.0:
@@ -207,10 +221,12 @@ class _Writer:
         return made
 
     def _name(self, element: Element) -> str:
-        model = element.root
+        model, name = element._root, element._given.get("name")
         parent: Any = element._parent
-        if element._given.get("name") or element.is_frame or parent.is_frame or element._tag == "composite":
+        if element._attached is not None or parent._attached is not None or element._tag == "composite":
             return model.identify(element, self.top) or ""
+        if name:
+            return self._prefix(model) + name
         numbers = self._unnamed.get(model)
         if numbers is None:
             counts: Counter[str] = Counter()
@@ -222,37 +238,49 @@ class _Writer:
         prefix = model.prefix(self.world)  # as PyMJCF does: the name in the compiled model
         return f"{prefix or '/'}/unnamed_{element.kind}_{numbers[element]}"
 
-    def _class(self, element: Element) -> str | None:
-        """Return the class of an element that names none; None where its body has one for its children."""
-        above = element._parent
-        while above is not None:
+    def _prefix(self, model: RootElement) -> str:
+        if model not in self._prefixes:
+            self._prefixes[model] = model.prefix(self.top)
+        return self._prefixes[model]
+
+    def _class(self, above: Element) -> str | None:
+        """Return the class of an element in another one that names none; None where a body has one for its children."""
+        if above not in self._classed:
             if above._given.get("childclass"):
-                return None
-            above = above._parent
-        return element.root.identify(element.root._child("default"), self.top)
+                found = None
+            elif above._parent is None:
+                found = above._root.identify(above._child("default"), self.top)
+            else:
+                found = self._class(above._parent)
+            self._classed[above] = found
+        return self._classed[above]
 
     def _text(self, element: Element, name: str, value: Any) -> str | None:
         """Return the value of an attribute as text; None where it is not written."""
-        model = element.root
-        if isinstance(value, files.Asset):
-            return _asset(element, value, self.top).get_vfs_filename()
-        if hasattr(value, "_given"):
-            return self._named(element, name, value)
+        if not isinstance(value, str):
+            if hasattr(value, "_given"):
+                return self._named(element, name, value)
+            if isinstance(value, files.Asset):
+                return _asset(element, value, self.top).get_vfs_filename()
+            if isinstance(value, np.ndarray):
+                self.arrays.append(value)
+            return self._digits(value)
+        model = element._root
         target = schema.reference(element._path, element._tag, name)
         if target == "default" and value == (model._child("default")._given.get("class") or "main"):
             return model.identify(model._child("default"), self.top)
         if target is not None:
-            return model.prefix(self.top) + value
+            return self._prefix(model) + value
         if element._tag == "flex" and name in ("body", "node"):
-            return " ".join(model.prefix(self.top) + word for word in str(value).split())
-        return value if isinstance(value, str) else self._digits(value)
+            return " ".join(self._prefix(model) + word for word in value.split())
+        return value
 
     def _digits(self, value: Any) -> str:
         """Return a number, or an array, as text."""
-        values = np.atleast_1d(value)
-        if values.dtype.kind != "f":
-            return " ".join(map(str, values.tolist()))
-        return " ".join([self._number] * values.size) % tuple(values.tolist())
+        values = np.atleast_1d(value).tolist()
+        if values and isinstance(values[0], float):
+            return " ".join([self._number] * len(values)) % tuple(values)
+        return " ".join(map(str, values))
 
     def _named(self, element: Element, name: str, target: Element) -> str | None:
         if target.is_removed:
@@ -298,6 +326,7 @@ class _Writer:
         """Return the numbers of a keyframe of any model, for the whole world."""
         alone = not self.top.frames
         names = key._key_order
+        self.arrays += [key._given[name] for name in names]
         if alone and all(_same(order, key.root.keyed_elements(name)) for name, order in names.items()):
             return {name: self._digits(key._given[name]) for name in names}
         layout = self.top.layout
@@ -369,7 +398,12 @@ def _same(order: list[Any], now: list[Any]) -> bool:
 
 
 def _tag(tag: str, attributes: dict[str, str], opens: bool = False) -> str:
-    inside = "".join(f" {name}={quoteattr(value)}" for name, value in attributes.items())
+    inside = "".join(
+        [
+            f" {name}={quoteattr(value)}" if _SPECIAL(value) else f' {name}="{value}"'
+            for name, value in attributes.items()
+        ]
+    )
     return f"<{tag}{inside}{'' if opens else '/'}>"
 
 

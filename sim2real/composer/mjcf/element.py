@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
     from sim2real.composer.mjcf.model import RootElement
 
 _POSE = ("pos", "quat", "axisangle", "xyaxes", "zaxis", "euler")
+_NO_ORDER: dict[str, list[Any]] = {}
+_CHANGES = itertools.count()
 _UNITS = {unit: 1 << 10 * (i + 1) for i, unit in enumerate("kmgtpe")}
 
 
@@ -34,15 +37,22 @@ class Element:
     """The model that an attachment frame holds."""
     _given: dict[str, Any]
     _key_order: dict[str, list[Any]]
-    """Of a keyframe: attribute -> the elements that its numbers belong to."""
+    """Of a keyframe: attribute -> the elements that its numbers belong to; of a removed element its name."""
     _root: RootElement
     _tag: str
     is_removed: bool
 
     def __init__(self, spec: schema.Spec, parent: Element | None, root: RootElement | None = None) -> None:
-        made = (None, [], {}, {}, parent, root or getattr(parent, "_root", None), spec, spec.name, False)
-        for name, value in zip(Element.__slots__, made, strict=True):
-            object.__setattr__(self, name, value)
+        put = object.__setattr__  # one by one: a model has hundreds of elements
+        put(self, "_attached", None)
+        put(self, "_children", [])
+        put(self, "_given", {})
+        put(self, "_key_order", {} if spec.name == "key" else _NO_ORDER)
+        put(self, "_parent", parent)
+        put(self, "_root", root or getattr(parent, "_root", None))
+        put(self, "_spec", spec)
+        put(self, "_tag", spec.name)
+        put(self, "is_removed", False)
 
     def __repr__(self) -> str:
         return f"MJCF Element: {self}"
@@ -108,6 +118,12 @@ class Element:
     def _path(self) -> str:
         parent = self._parent
         return self._tag if parent is None or parent is self._root else f"{parent._tag}.{self._tag}"
+
+    def _note_change(self) -> None:
+        """Note that the text of the model may differ from now on."""
+        object.__setattr__(self._root, "changes", next(_CHANGES))
+        if self._root.parent_model is not None and self._is_setting:  # it belongs to the model at the top
+            object.__setattr__(self._root.root_model, "changes", next(_CHANGES))
 
     # -- attributes
 
@@ -180,6 +196,7 @@ class Element:
         self._set(self._checked(name, "object has no attribute: "), None)
 
     def _set(self, name: str, value: Any) -> None:
+        self._note_change()
         values = self._values(name)
         value = None if isinstance(value, str) and not value else value
         if name == self._spec.named_by:
@@ -283,11 +300,13 @@ class Element:
         if child is None:
             child = Element(self._spec.children[tag], self)
             place = len(self._children)
-            if self._tag == "default":  # in MJCF's order, whenever it is first used: classes of actuators share values
+            if self._tag in ("default", "mujoco"):  # in MJCF's order, whenever it is first used
                 order = list(self._spec.children)
                 later = order[order.index(tag) :]
                 place = next((i for i, c in enumerate(self._children) if c._tag in later), place)
             self._children.insert(place, child)
+            if self is self._root and self._root.parent_model is not None:  # sections hold those of attached models
+                self._root.parent_model._child(tag)
         return child
 
     def get_children(self, tag: str) -> Any:
@@ -318,6 +337,7 @@ class Element:
                 f"<freejoint> is not a valid child of {self.full_identifier!r}, which does not stand in the world",
                 hint="attach the model to the world, or use hinge and slide joints",
             )
+        self._note_change()
         element = Element(spec, self)
         attrs = {("class" if k in ("dclass", "class_") else k): v for k, v in attrs.items()}
         if tag in files.NAMED_AFTER and "name" not in attrs and isinstance(attrs.get("file"), str):
@@ -347,6 +367,7 @@ class Element:
         Args:
             affect_attachments: Whether models that are attached below it may be detached.
         """
+        self._note_change()
         below = [e for e in self.walk(own=True) if e._attached is not None]
         others = [] if below or self.is_worldbody else self.attached_children()
         shared = self._is_setting and (self._root.parent_model is not None or self._root.frames)
@@ -365,7 +386,7 @@ class Element:
         name = self._given.get(self._spec.named_by)
         self._root.rename(self, name, None)
         self._given.clear()
-        self._key_order["name"] = [name]  # for messages
+        self._key_order = {"name": [name]}  # for messages
         if self._parent is not None and (self._spec.repeated or not self._spec.implicit):
             self._parent._children.remove(self)
             self.is_removed = True
@@ -378,6 +399,8 @@ class Element:
         return list(self._with_attached())
 
     def _with_attached(self) -> list[Element]:
+        if self._attached is None and (self._parent is not self._root or not self._root.frames):
+            return self._children
         attached = self.attached_children()
         return [*self._children, *attached] if attached else self._children
 
@@ -386,7 +409,8 @@ class Element:
         if self._attached is not None:
             return self._attached.worldbody._with_attached()
         if self._parent is self._root and self._tag not in ("worldbody", "default") and not self._is_setting:
-            return [c for m in self._root.attached_models() for c in m._child(self._tag)._with_attached()]
+            sections = [m._present(self._tag) for m in self._root.frames]
+            return [c for section in sections if section is not None for c in section._with_attached()]
         return []
 
     def walk(self, own: bool = False) -> Iterator[Element]:
@@ -397,26 +421,26 @@ class Element:
             yield element
             waiting.extend(reversed(element._children if own else element._with_attached()))
 
-    def find(self, kind: str, identifier: str | None = None, *, name: str | None = None) -> Any:
+    def find(self, namespace: str, identifier: str | None = None, *, name: str | None = None) -> Any:
         """Return the element of a kind with a name such as ``finger`` or ``hand/finger`` below this one, or None."""
-        found = self._root.look_up(kind, identifier if identifier is not None else name)
+        found = self._root.look_up(namespace, identifier if identifier is not None else name)
         above = found
         while isinstance(above, Element) and above is not self and self is not self._root:
             above = above._parent
         return found if above is self or self is self._root else None
 
     def find_all(
-        self, kind: str, immediate_children_only: bool = False, exclude_attachments: bool = False
+        self, namespace: str, immediate_children_only: bool = False, exclude_attachments: bool = False
     ) -> list[Element]:
         """Return the elements of a kind below this one, in the order of the document."""
-        if kind not in schema.KINDS and kind not in KIND_OF_TAG:
-            raise UsageError(f"{kind!r} is not a valid namespace. Available: {', '.join(schema.KINDS)}")
-        kind = KIND_OF_TAG.get(kind, kind)
+        if namespace not in schema.KINDS and namespace not in KIND_OF_TAG:
+            raise UsageError(f"{namespace!r} is not a valid namespace. Available: {', '.join(schema.KINDS)}")
+        namespace = KIND_OF_TAG.get(namespace, namespace)
         if immediate_children_only:
             found: Iterable[Element] = self._children if exclude_attachments else self._with_attached()
         else:
             found = (e for e in self.walk(exclude_attachments) if e is not self)
-        return [e for e in found if e._spec.kind == kind]
+        return [e for e in found if e._spec.kind == namespace]
 
     def enter_scope(self, scope_identifier: str) -> RootElement | None:
         """Return the model attached under a name such as ``arm/hand``, or None."""
@@ -428,12 +452,13 @@ class Element:
             raise UsageError(
                 f"a model is attached to a site or the world, not to the {self.kind} {self.full_identifier!r}"
             )
+        self._note_change()
         self._root.adopt(attachment)
         holder: Any = self if self.is_worldbody else self._parent
         frame = Element(schema.root().children["worldbody"].children["body"], holder)
         frame._attached = attachment
         self._root.frames[attachment] = frame
-        frame._given.update({k: v for k, v in self._given.items() if k in _POSE})
+        frame._given.update({k: v.copy() for k, v in self._given.items() if k in _POSE})
         position = len(holder._children)
         if not self.is_worldbody:
             position = holder._children.index(self) + 1
@@ -441,6 +466,11 @@ class Element:
                 position += 1
         holder._children.insert(position, frame)
         return frame
+
+    @property
+    def _says(self) -> bool:
+        """Whether the element is more than an empty one that is there without being added."""
+        return not self._spec.implicit or bool(self._given) or any(c._says for c in self._with_attached())
 
     def is_same_as(self, other: Element | None) -> bool:
         """Return whether another element has the same tag, attributes and children."""
@@ -456,13 +486,14 @@ class Element:
             return False
         ordered = self.kind == "tendon"  # the order of a path counts
         for tag in (None,) if ordered else self._spec.children:
-            one, two = ([c for c in e._with_attached() if tag in (None, c._tag)] for e in (self, other))
+            one, two = ([c for c in e._with_attached() if tag in (None, c._tag) and c._says] for e in (self, other))
             if len(one) != len(two) or not all(a.is_same_as(b) for a, b in zip(one, two, strict=True)):
                 return False
         return True
 
     def resolve_references(self) -> None:
         """Let attributes that name elements by text hold the elements."""
+        self._note_change()
         for element in self.walk():
             for name, value in element._given.items():
                 target = schema.reference(element._path, element._tag, name) if isinstance(value, str) else None

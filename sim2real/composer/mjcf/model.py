@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import functools
 import logging
 import os
 from collections.abc import Iterator
@@ -34,21 +36,24 @@ class RootElement(Element):
         assets: Name of a file -> its contents, for files that are given in memory.
         model_dir: Where relative paths of files begin.
         is_document: Whether a document gave it, whose angles are in degrees unless it says otherwise.
+        changes: A number that is another one after every change, but not after writing into an attribute's array.
+        written: What ``to_xml_string`` returned, and what it depends on.
     """
 
     __slots__ = (
-        *("__weakref__", "_name", "_names", "assets", "frames", "is_document", "layout", "model_dir", "parent_model"),
+        *("__weakref__", "_name", "_names", "assets", "changes", "frames", "is_document", "layout", "model_dir"),
+        *("parent_model", "written"),
     )
 
     def __init__(
         self, model: str | None = None, model_dir: str | os.PathLike[str] = "", assets: dict[str, bytes] | None = None
     ) -> None:
         super().__init__(schema.root(), None, self)
-        made = {"_name": "", "_names": {}, "assets": assets or {}, "frames": {}, "is_document": False, "layout": None}
-        for name, value in (made | {"model_dir": os.fspath(model_dir), "parent_model": None}).items():
+        made = {"_name": "", "_names": {}, "assets": assets or {}, "changes": -1, "frames": {}, "is_document": False}
+        made |= {"layout": None, "model_dir": os.fspath(model_dir), "parent_model": None, "written": None}
+        for name, value in made.items():
             object.__setattr__(self, name, value)
         self.model = model or "unnamed_model"
-        self._children.extend(Element(spec, self) for spec in self._spec.children.values())
 
     @classmethod
     def from_xml_string(
@@ -66,8 +71,7 @@ class RootElement(Element):
             model_dir: Where relative paths of files begin; default: the working directory.
             resolve_references: False: attributes that name elements read as text until ``resolve_references()``.
         """
-        node = _parsed(xml_string, "the document")
-        return _from_node(node, Path(model_dir), Path(model_dir), assets or {}, resolve_references)
+        return _from_text(xml_string, "the document", Path(model_dir), assets or {}, resolve_references)
 
     @classmethod
     def from_path(
@@ -81,8 +85,7 @@ class RootElement(Element):
         path = Path(path)
         if not path.is_file():
             raise NoSuchFileError(f"there is no MJCF file {str(path)!r}", hint="give the path of a file that exists")
-        node = _parsed(path.read_bytes(), str(path))
-        return _from_node(node, path.parent, path.parent, assets or {}, resolve_references)
+        return _from_text(path.read_bytes(), str(path), path.parent, assets or {}, resolve_references)
 
     @classmethod
     def from_file(
@@ -117,14 +120,14 @@ class RootElement(Element):
 
     def __deepcopy__(self, memo: dict[int, Any]) -> RootElement:
         copies: dict[Element, Element] = {}
-        copy = _copied(self, copies)
+        made = _copied(self, copies)
         for element in copies.values():  # what names an element of the copied models names its copy
             for name, value in element._given.items():
                 if isinstance(value, Element):
                     element._given[name] = copies.get(value, value)
             for name, order in element._key_order.items():
                 element._key_order[name] = [(copies.get(e, e), *rest) for e, *rest in order]
-        return copy
+        return made
 
     def get_attributes(self) -> dict[str, Any]:
         """Return the explicit attributes: the model's name."""
@@ -145,6 +148,7 @@ class RootElement(Element):
         if parent is not None and any(m.model == name for m in parent.frames if m is not self):
             attached = ", ".join(m.model for m in parent.frames)
             raise UsageError(f"model {parent.model!r} has {name!r} attached already. Attached: {attached}")
+        self._note_change()
         object.__setattr__(self, "_name", name)
 
     @property
@@ -267,11 +271,14 @@ class RootElement(Element):
         if model is self.root_model:
             raise UsageError(f"Cannot merge a model to itself: {model.model!r}")
         for element, name, value in list(_merged(model, self.root_model)):
-            element._given[name] = value
+            element._note_change()
+            element._given[name] = copy.copy(value)
         taken = {m.model for m in self.frames}
         names = (model.model if i == 0 else f"{model.model}_{i}" for i in range(len(taken) + 1))
         model.model = next(n for n in names if n not in taken)
         object.__setattr__(model, "parent_model", self)
+        for section in model._children:
+            self._child(section._tag)
         self._warn_of_degrees(model)
 
     def _warn_of_degrees(self, model: RootElement) -> None:
@@ -296,8 +303,9 @@ class RootElement(Element):
             raise UsageError(f"Cannot detach model {self.model!r}: it is not attached")
         for section in [c for c in self.root_model._children if c.tag in SETTINGS]:  # they stay as they were shared
             for element in section.walk(own=True):
-                kept = {k: v for k, v in element._given.items() if k not in schema.OWN_SETTINGS}
+                kept = {k: copy.copy(v) for k, v in element._given.items() if k not in schema.OWN_SETTINGS}
                 element._in(self)._given.update(kept)
+        self._note_change()
         frame = parent.frames.pop(self)
         object.__setattr__(self, "parent_model", None)
         frame._attached = None
@@ -355,31 +363,45 @@ def _merged(model: RootElement, top: RootElement) -> Iterator[tuple[Element, str
 
 
 def _copied(model: RootElement, copies: dict[Element, Element]) -> RootElement:
-    copy = RootElement(model.model, model.model_dir, dict(model.assets))
-    object.__setattr__(copy, "is_document", model.is_document)
-    copies[model] = copy
+    made_model = RootElement(model.model, model.model_dir, dict(model.assets))
+    object.__setattr__(made_model, "is_document", model.is_document)
+    copies[model] = made_model
 
     def fill(old: Element, new: Element) -> None:
         copies[old] = new
         for name, value in old._given.items():
             new._given[name] = value.copy() if isinstance(value, np.ndarray) else value
-        new._key_order.update(old._key_order)
+        if old._key_order:
+            new._key_order = dict(old._key_order)
         new._children.clear()
         for child in old._children:
-            made = Element(child._spec, new, copy)
+            made = Element(child._spec, new, made_model)
             new._children.append(made)
             if child._attached is not None:
                 attached = _copied(child._attached, copies)
                 made._attached = attached
-                object.__setattr__(attached, "parent_model", copy)
+                object.__setattr__(attached, "parent_model", made_model)
             fill(child, made)
-            copy.rename(made, None, made._given.get(made._spec.named_by))
+            made_model.rename(made, None, made._given.get(made._spec.named_by))
 
-    fill(model, copy)
+    fill(model, made_model)
     for attached, frame in model.frames.items():
         new: Any = copies[attached]
-        copy.frames[new] = copies[frame]
-    return copy
+        made_model.frames[new] = copies[frame]
+    return made_model
+
+
+def _from_text(text: str | bytes, what: str, folder: Path, assets: dict[str, bytes], resolves: bool) -> RootElement:
+    word = "file" if isinstance(text, str) else b"file"
+    if assets or word in text:  # pyright: ignore[reportOperatorIssue]
+        return _from_node(_parsed(text, what), folder, folder, assets, resolves)
+    return copy.copy(_document(text, what, folder, resolves))
+
+
+@functools.lru_cache(maxsize=32)
+def _document(text: str | bytes, what: str, folder: Path, resolves: bool) -> RootElement:
+    """Return the model of a document without files; worlds often have many copies of one."""
+    return _from_node(_parsed(text, what), folder, folder, {}, resolves)
 
 
 def _parsed(text: str | bytes, what: str) -> ElementTree.Element:
@@ -405,7 +427,7 @@ def _from_node(
     _fill(model, node)
     if resolves:
         model.resolve_references()
-    for key in model.find_all("key"):
+    for key in model._child("keyframe")._children:
         for name in KEYED.keys() & key._given.keys():
             key._key_order[name] = model.keyed_elements(name)
     return model

@@ -43,7 +43,7 @@ class Spec:
         """Whether there may be one in a parent, once it is added."""
         return not self.repeated and not self.implicit
 
-    @property
+    @functools.cached_property
     def named_by(self) -> str:
         """The attribute that holds the name; '' where elements have no names."""
         return _NAMES.get(self.name, "name" if self.kind else "")
@@ -212,6 +212,7 @@ _REFERENCES = {
 }  # fmt: skip
 
 
+@functools.cache
 def reference(path: str, tag: str, name: str) -> str | None:
     """Return the kind of element that an attribute names, or the attribute that says it; None where it names none."""
     if path.startswith(("visual", "option")) or (name, tag) in (("class", "default"), ("body", "flex")):

@@ -15,7 +15,7 @@ from sim2real.composer.physics.arrays import namespace
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from sim2real.composer.mjcf.element import Elements
     from sim2real.composer.physics.base import BasePhysics
@@ -129,40 +129,47 @@ class Observable(ABC):
 
 
 class Generic(Observable):
-    """A function of the physics.
+    """A function of the physics; see ``Observable`` for the options of samples.
 
     Args:
         raw_observation_callable: Takes the physics, returns a number or an array.
-        *sampling: Options of ``Observable``, from ``update_interval`` to ``corruptor``; also by name.
     """
 
     def __init__(
-        self, raw_observation_callable: Callable[[PyTree], PyTree], *sampling: PyTree, **options: PyTree
+        self,
+        raw_observation_callable: Callable[[PyTree], PyTree],
+        update_interval: Steps = 1,
+        buffer_size: Steps | None = None,
+        delay: Steps | None = None,
+        aggregator: str | Aggregate | None = None,
+        corruptor: Corrupt | None = None,
     ) -> None:
         self._raw_callable = raw_observation_callable
-        super().__init__(*sampling, **options)
+        super().__init__(update_interval, buffer_size, delay, aggregator, corruptor)
 
     def _callable(self, physics: BasePhysics) -> Callable[[], PyTree]:
         return functools.partial(self._raw_callable, physics)
 
 
 class MujocoFeature(Observable):
-    """Rows of an array of mjData, by name.
+    """Rows of an array of mjData, by name; see ``Observable`` for the options of samples.
 
     Args:
         feature_name: Name or names of elements, or a callable that returns them.
-        *sampling: Options of ``Observable``, from ``update_interval`` to ``corruptor``; also by name.
     """
 
     def __init__(
         self,
         kind: str,
         feature_name: str | Sequence[str] | Callable[[], str | Sequence[str]],
-        *sampling: PyTree,
-        **options: PyTree,
+        update_interval: Steps = 1,
+        buffer_size: Steps | None = None,
+        delay: Steps | None = None,
+        aggregator: str | Aggregate | None = None,
+        corruptor: Corrupt | None = None,
     ) -> None:
         self._kind, self._feature_name = kind, feature_name
-        super().__init__(*sampling, **options)
+        super().__init__(update_interval, buffer_size, delay, aggregator, corruptor)
 
     def _callable(self, physics: BasePhysics) -> Callable[[], PyTree]:
         array, name = getattr(physics.named.data, self._kind), self._feature_name
@@ -170,24 +177,31 @@ class MujocoFeature(Observable):
 
 
 class MJCFFeature(Observable):
-    """An attribute of an element, or of several of one kind, as ``physics.bind`` names it.
+    """An attribute of an element, or of several of one kind; see ``Observable`` for the options of samples.
 
     ``feature[index]`` observes a part of it.
 
     Args:
-        kind: The attribute, such as ``qpos`` or ``xpos``.
-        *sampling: Options of ``Observable``, from ``update_interval`` to ``corruptor``; also by name.
+        kind: The attribute as ``physics.bind`` names it, such as ``qpos`` or ``xpos``.
 
     Raises:
         UsageError: When something given is no element.
     """
 
     def __init__(
-        self, kind: str, mjcf_element: Elements, *sampling: PyTree, index: PyTree = None, **options: PyTree
+        self,
+        kind: str,
+        mjcf_element: Elements,
+        update_interval: Steps = 1,
+        buffer_size: Steps | None = None,
+        delay: Steps | None = None,
+        aggregator: str | Aggregate | None = None,
+        corruptor: Corrupt | None = None,
+        index: PyTree = None,
     ) -> None:
         as_elements(mjcf_element)  # refuses what is none
         self._kind, self._element, self._index = kind, mjcf_element, index
-        super().__init__(*sampling, **options)
+        super().__init__(update_interval, buffer_size, delay, aggregator, corruptor)
 
     def _callable(self, physics: BasePhysics) -> Callable[[], PyTree]:
         binding, kind, index = physics.bind(self._element), self._kind, self._index
@@ -203,16 +217,27 @@ class MJCFFeature(Observable):
         return MJCFFeature(self._kind, self._element, *sampling, index=key)
 
 
-class _Image(Observable):
-    """An image: uint8 ``(height, width, 3)``, depth float32 ``(.., 1)`` [m] or segmentation int32 ``(.., 2)``."""
+class MujocoCamera(Observable):
+    """The image of a camera, by name: uint8 ``(height, width, 3)``, depths float32 ``(.., 1)`` [m]."""
 
-    def _set_image(
-        self, height: int, width: int, depth: bool, segmentation: bool, scene_option: MjvOption | None
+    _segmentation = False
+    scene_option: MjvOption | None = None
+    _flags: Mapping[str | int, bool] | None = None
+
+    def __init__(
+        self,
+        camera_name: str,
+        height: int = 240,
+        width: int = 320,
+        update_interval: Steps = 1,
+        buffer_size: Steps | None = None,
+        delay: Steps | None = None,
+        aggregator: str | Aggregate | None = None,
+        corruptor: Corrupt | None = None,
+        depth: bool = False,
     ) -> None:
-        if depth and segmentation:
-            raise UsageError("`segmentation` and `depth` cannot both be `True`.")
-        self.height, self.width, self._depth, self._segmentation = height, width, depth, segmentation
-        self.scene_option = scene_option
+        self._name, self.height, self.width, self._depth = camera_name, height, width, depth
+        super().__init__(update_interval, buffer_size, delay, aggregator, corruptor)
 
     @property
     def array_spec(self) -> specs.BoundedArray:
@@ -224,47 +249,22 @@ class _Image(Observable):
             channels, dtype, low, high = 3, np.uint8, 0, 255
         return specs.BoundedArray((self.height, self.width, channels), dtype, minimum=low, maximum=high)
 
-    @abstractmethod
     def _camera(self, physics: PyTree) -> str | int:
         """Return the camera's name or number."""
+        return self._name
 
     def _callable(self, physics: PyTree) -> Callable[[], PyTree]:
         kind = {"depth": self._depth, "segmentation": self._segmentation, "scene_option": self.scene_option}
-        size = (self.height, self.width)
-        return lambda: np.atleast_3d(physics.render(*size, self._camera(physics), **kind))
+        size, flags = (self.height, self.width), self._flags
+        return lambda: np.atleast_3d(physics.render(*size, self._camera(physics), **kind, render_flag_overrides=flags))
 
 
-class MujocoCamera(_Image):
-    """The image of a camera, by name.
-
-    Args:
-        *sampling: Options of ``Observable``, from ``update_interval`` to ``corruptor``; also by name.
-    """
-
-    def __init__(
-        self,
-        camera_name: str,
-        height: int = 240,
-        width: int = 320,
-        *sampling: PyTree,
-        depth: bool = False,
-        **options: PyTree,
-    ) -> None:
-        self._name = camera_name
-        self._set_image(height, width, depth, False, None)
-        super().__init__(*sampling, **options)
-
-    def _camera(self, physics: PyTree) -> str:
-        return self._name
-
-
-class MJCFCamera(_Image):
-    """The image of a camera element.
+class MJCFCamera(MujocoCamera):
+    """The image of a camera element; segmentations are int32 ``(height, width, 2)``: numbers and types of objects.
 
     Args:
-        *sampling: Options of ``Observable``, from ``update_interval`` to ``corruptor``; also by name.
-        segmentation: Numbers and types of objects instead of colours.
         scene_option: The ``MjvOption`` of the image.
+        render_flag_overrides: See ``Physics.render``.
 
     Raises:
         UsageError: When the element is no camera, or depth and segmentation are both asked for.
@@ -275,17 +275,24 @@ class MJCFCamera(_Image):
         mjcf_element: Element,
         height: int = 240,
         width: int = 320,
-        *sampling: PyTree,
+        update_interval: Steps = 1,
+        buffer_size: Steps | None = None,
+        delay: Steps | None = None,
+        aggregator: str | Aggregate | None = None,
+        corruptor: Corrupt | None = None,
         depth: bool = False,
         segmentation: bool = False,
         scene_option: MjvOption | None = None,
-        **options: PyTree,
+        render_flag_overrides: Mapping[str | int, bool] | None = None,
     ) -> None:
         if not isinstance(mjcf_element, Element) or mjcf_element.kind != "camera":
             raise UsageError(f"expected a <camera> element: got {mjcf_element}")
-        self._element = mjcf_element
-        self._set_image(height, width, depth, segmentation, scene_option)
-        super().__init__(*sampling, **options)
+        if depth and segmentation:
+            raise UsageError("`segmentation` and `depth` cannot both be `True`.")
+        sampling = (update_interval, buffer_size, delay, aggregator, corruptor)
+        super().__init__("", height, width, *sampling, depth)
+        self._element, self._segmentation = mjcf_element, segmentation
+        self.scene_option, self._flags = scene_option, render_flag_overrides
 
     def _camera(self, physics: PyTree) -> int:
         return physics.bind(self._element).element_id
