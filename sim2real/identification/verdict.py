@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -72,6 +73,21 @@ def errors_of(row: HeldOut) -> dict[str, float]:
     return {model: math.inf if error is None else error for model, error in row.rmse.items()}
 
 
+@dataclass(frozen=True)
+class Lack:
+    """What the model lacks.
+
+    Attributes:
+        reasons: Sentences on residuals and free runs.
+        flags: Flags with which to identify again; "": no term mends the model.
+        unexplained: Whether the residuals are so far above the noise that no parameter can be trusted.
+    """
+
+    reasons: tuple[str, ...] = ()
+    flags: str = ""
+    unexplained: bool = False
+
+
 def judge(
     held_out: Sequence[HeldOut],
     table: ParameterTable,
@@ -83,6 +99,8 @@ def judge(
     widened: Collection[str] = (),
     beyond: Sequence[str] = (),
     left: float | None = None,
+    exceeded: Sequence[str] = (),
+    lacks: Lack = Lack(),
 ) -> Judgement:
     """Judge an identification; ``next`` of the result are flags with which to identify again.
 
@@ -93,10 +111,12 @@ def judge(
         widened: Parameters whose bounds the user has set: wider ones would not help again.
         beyond: Sentences about held-out data outside the range of the fitted data.
         left: Length of the next step of a fit that did not converge [standard errors]; None if it converged.
+        exceeded: Sentences about errors on held-out data above the expected ones.
+        lacks: What the model lacks.
     """
     improves, errors = _on_held_out(held_out)
     if left is not None:
-        return Judgement(NOT_FINISHED, (_not_converged(left), *errors, *beyond))
+        return Judgement(NOT_FINISHED, (_not_converged(left), *errors, *beyond, *exceeded, *lacks.reasons))
     # Collect the reasons: estimates at bounds, absent parameters, undetermined groups.
     determined = [i for i, n in enumerate(table.names) if not any(n in group for group in check.undetermined)]
     bounded, at_zero, flags = _at_bounds(table, x, spread, determined, max_delay_s, widened)
@@ -109,16 +129,22 @@ def judge(
             f"residuals are {spread.misfit:.2g} times the measurement's deviation: the model explains the data only in "
             "part, and intervals follow how much estimates vary from block to block"
         )
-    # The first of these defects decides.
-    status: Status = ACCEPTED
-    deciding = errors
-    if not improves:
-        status = CHANGE
-    elif bounded:
-        status, deciding = CHANGE, bounded
-    elif undetermined:
-        status, deciding = RECORD, undetermined
-    return Judgement(status, tuple(dict.fromkeys([*deciding, *reasons])), flags)
+    # The first rule that holds decides the status, and its sentences come first. Wider bounds do not help a model that
+    # lacks a term, as it bends its other parameters; nor does another recording before the bounds are right.
+    lacking = [*lacks.reasons, *exceeded]
+    rules: tuple[tuple[bool, Status, Sequence[str]], ...] = (
+        (improves and not bounded and bool(undetermined), RECORD, undetermined),
+        (bool(lacks.flags), CHANGE, lacking),
+        (not improves, CHANGE, errors),
+        (bool(bounded), CHANGE, bounded),
+        (lacks.unexplained, CHANGE, lacking),
+        (bool(exceeded), CHANGE, exceeded),
+        (True, ACCEPTED, errors),
+    )
+    status, deciding = next((status, why) for holds, status, why in rules if holds)
+    return Judgement(
+        status, tuple(dict.fromkeys([*deciding, *reasons, *exceeded, *lacks.reasons])), lacks.flags or flags
+    )
 
 
 def state_of(verdict: str, p: Parameter, upper: bool) -> str:

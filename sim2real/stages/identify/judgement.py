@@ -32,7 +32,8 @@ from sim2real.identification import verdict
 from sim2real.identification.delays import links
 from sim2real.identification.expected import wider_for, with_expected_errors
 from sim2real.identification.fit import Fit, Value, as_numbers, refine, refit
-from sim2real.identification.model import measured_channels
+from sim2real.identification.model import IdentifiableModel, measured_channels
+from sim2real.identification.parameters import ParameterTable
 from sim2real.identification.predictions import Position, positions, replays, worst_second
 from sim2real.identification.problem import Problem, few_of
 from sim2real.identification.residuals import Linearised
@@ -48,8 +49,7 @@ from sim2real.identification.uncertainty import (
 )
 from sim2real.identification.uncertainty import determined as what_is_determined
 from sim2real.identification.uncertainty import widening as posterior_widening
-from sim2real.identification.verdict import ACCEPTED, CHANGE, NO_DELAY, scores, state_of
-from sim2real.robots.robot import in_world
+from sim2real.identification.verdict import ACCEPTED, CHANGE, NO_DELAY, Lack, scores, state_of
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.identify.fitting import (
     LEAST_SEGMENTS,
@@ -60,10 +60,10 @@ from sim2real.stages.identify.fitting import (
     widened,
     without_parts,
 )
-from sim2real.stages.identify.inputs import Inputs, table_of, with_load
+from sim2real.stages.identify.inputs import Inputs, configured, table_of, with_load
 from sim2real.stages.identify.true_values import true_values
 from sim2real.stages.load import defaults_of
-from sim2real.stages.shared.identification import offering, split_of, usable, with_wanted_terms
+from sim2real.stages.shared.identification import split_of, usable
 from sim2real.stages.terminal.console import note, progress, shown
 from sim2real.stages.terminal.interruption import patiently
 
@@ -346,21 +346,6 @@ def _compared(
     return document, [f"held-out data extrapolates: {text}" for text in outside]
 
 
-@dataclass(frozen=True)
-class Lack:
-    """What the model lacks.
-
-    Attributes:
-        reasons: Sentences on residuals and free runs.
-        flags: Flags with which to identify again; "": no term mends the model.
-        unexplained: Whether the residuals are so far above the noise that no parameter can be trusted.
-    """
-
-    reasons: tuple[str, ...] = ()
-    flags: str = ""
-    unexplained: bool = False
-
-
 def lack(document: Identification, inputs: Inputs, fit: Fit) -> tuple[Identification, Lack]:
     """Return the document with the tried terms, and what the model lacks.
 
@@ -432,20 +417,15 @@ def inclined(inputs: Inputs, fit: Fit) -> tuple[float, dict[str, float], str] | 
     """
     config, chosen = inputs.config, fit.problem.table.terms
     wanted = ",".join([*chosen, _TILT])
-    robot = offering(in_world(inputs.loaded, config.world), wanted)
-    model, episodes = measured_channels(robot.identifiable(config.max_delay_s), inputs.episodes), inputs.episodes
+    model = _model_with(inputs, wanted)
     turns = [p.name for p in model.parameters if p.term == _TILT]
     if not turns or _TILT in chosen or set(turns) & set(config.fix):
         return None
-    around = {name: (-math.pi, math.pi) for name in turns}
-    bounded = model.parameters.with_bounds({**config.bounds, **around}).with_reached(
-        model.reached(episodes[: inputs.fitted])
-    )
-    table = with_wanted_terms(bounded, wanted).with_fixed(config.fix)
+    table = _table_with(inputs, model, wanted, dict.fromkeys(turns, (-math.pi, math.pi)))
     if not set(fit.values) <= {p.name for p in table}:
         return None
     length_s = config.settle_s + config.horizon_s
-    problem = few_of(Problem(model, episodes, inputs.windows, length_s, config, table))
+    problem = few_of(Problem(model, inputs.episodes, inputs.windows, length_s, config, table))
     estimate = problem.table.encode({p.name: p.without for p in problem.table} | fit.values)
     columns = np.array([c.parameter.name in turns for c in problem.table.columns])
     starts = []
@@ -510,16 +490,14 @@ def _tried(inputs: Inputs, fit: Fit) -> tuple[TriedTerm, ...]:
     The three most promising ones by linear algebra and the limits are fitted, without refits: about as long as the fit.
     """
     config, chosen = inputs.config, fit.problem.table.terms
-    robot = offering(in_world(inputs.loaded, config.world), ",".join(["auto", *chosen]))
-    model, episodes = measured_channels(robot.identifiable(config.max_delay_s), inputs.episodes), inputs.episodes
-    bounded = model.parameters.with_bounds(config.bounds).with_reached(model.reached(episodes[: inputs.fitted]))
-    table = with_wanted_terms(bounded, "all").with_fixed(config.fix)
+    model = _model_with(inputs, ",".join(["auto", *chosen]))
+    table = _table_with(inputs, model, "all")
     further = set(table.terms) - set(chosen)
     if not further or not set(fit.values) <= {p.name for p in table}:
         return ()
     # Put the estimate into the model with all terms, and compare single terms.
     length_s = config.settle_s + config.horizon_s
-    problem = Problem(model, episodes, inputs.windows, length_s, config, table)
+    problem = Problem(model, inputs.episodes, inputs.windows, length_s, config, table)
     values = {p.name: p.without for p in problem.table} | fit.values
     x = problem.table.encode(values)
     whole = replace(fit, problem=problem, windows=problem, x=x, refined=(), search=None)
@@ -531,13 +509,11 @@ def _tried(inputs: Inputs, fit: Fit) -> tuple[TriedTerm, ...]:
 
 def _free_runs_with(inputs: Inputs, wanted: str, term: str) -> Sequence[FreeRun] | None:
     """Return the free runs of the model with further terms; None if the robot has no free parameter of the last one."""
-    config = replace(inputs.config, terms=wanted, generations=0)
-    robot = offering(in_world(inputs.loaded, config.world), wanted)
-    model, episodes = measured_channels(robot.identifiable(config.max_delay_s), inputs.episodes), inputs.episodes
+    config, model = replace(inputs.config, terms=wanted, generations=0), _model_with(inputs, wanted)
     if {p.name for p in model.parameters if p.term == term} <= set(config.fix):
         return None
     # Search from the start, as the printed command does: a fit without the term has distorted other parameters.
-    table = table_of(model, config, episodes[: inputs.fitted])
+    table, episodes = _table_with(inputs, model, wanted), inputs.episodes
     refitted = fitted_to(model, episodes, inputs.fitted, inputs.windows, config, table)
     return free_runs(refitted, episodes, inputs.fitted, config, {"identified": refitted.values})[0]
 
@@ -557,8 +533,8 @@ def _judged(
         set_by_user: Parameters whose bounds the user has set.
     """
     fit, measured = findings.fit, positions(findings.fit.problem.model, inputs.units)
-    # Judge the errors on held-out data, the intervals and the bounds.
     rows = scores(document.prediction, measured)
+    above = [str(row) for row in sorted(document.compared, key=lambda r: -(r.ratio or 0.0)) if row.exceeded]
     judged = verdict.judge(
         rows,
         fit.problem.table,
@@ -566,22 +542,13 @@ def _judged(
         findings.spread,
         findings.check,
         max_delay_s=inputs.config.max_delay_s,
-        # Wider bounds do not help a model that lacks a term: it bends its other parameters.
         widened=fit.problem.table.names if lacks.flags else set_by_user,
         beyond=doubts,
         left=None if fit.converged else fit.left,
+        exceeded=above[:_MOST] + [f"{len(above) - _MOST} more errors are above"] * (len(above) > _MOST),
+        lacks=lacks,
     )
-    # Add errors above the expected ones, and what the free runs show; the reason for the status comes first.
-    status, reasons = judged.status, list(judged.reasons)
-    exceeded = [str(row) for row in sorted(document.compared, key=lambda r: -(r.ratio or 0.0)) if row.exceeded]
-    more = exceeded[:_MOST] + [f"{len(exceeded) - _MOST} more errors are above"] * (len(exceeded) > _MOST)
-    if (lacks.flags and status in (ACCEPTED, CHANGE)) or (lacks.unexplained and status == ACCEPTED):
-        status, reasons = CHANGE, [*lacks.reasons, *more, *reasons]
-    elif status == ACCEPTED and exceeded:
-        status, reasons = CHANGE, [*more, *reasons, *lacks.reasons]
-    else:
-        reasons += [*more, *lacks.reasons]
-    flags = lacks.flags or judged.next
+    status, reasons, flags = judged.status, list(judged.reasons), judged.next
     if status == CHANGE and not (flags or lacks.unexplained) and _offers_more(inputs, fit):
         flags = "--terms auto"
     # A fault in fitted data changes no held-out error, so it does not change the status.
@@ -603,7 +570,18 @@ def _offers_more(inputs: Inputs, fit: Fit) -> bool:
     config = inputs.config
     if config.terms == "auto" or not _has_parts(inputs, fit):
         return False
-    robot = offering(in_world(inputs.loaded, config.world), "auto")
-    return bool(
-        {p.term for p in robot.identifiable(config.max_delay_s).parameters if p.term} - set(fit.problem.table.terms)
-    )
+    return bool({p.term for p in _model_with(inputs, "auto").parameters if p.term} - set(fit.problem.table.terms))
+
+
+def _model_with(inputs: Inputs, wanted: str) -> IdentifiableModel:
+    """Return the model of the robot with optional terms; see ``offering``."""
+    robot = configured(inputs.loaded, replace(inputs.config, terms=wanted))
+    return measured_channels(robot.identifiable(inputs.config.max_delay_s), inputs.episodes)
+
+
+def _table_with(
+    inputs: Inputs, model: IdentifiableModel, wanted: str, bounds: Mapping[str, tuple[float, float]] | None = None
+) -> ParameterTable:
+    """Return the parameters of a model with optional terms, and with further bounds."""
+    config = replace(inputs.config, terms=wanted, bounds={**inputs.config.bounds, **(bounds or {})})
+    return table_of(model, config, inputs.episodes[: inputs.fitted])

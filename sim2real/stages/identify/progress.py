@@ -7,7 +7,7 @@ while they are judged; it stays if a signal or an error ends the stage before th
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -35,28 +35,37 @@ class Best:
     """The best values of a fit so far.
 
     Attributes:
+        folder: Folder of the stage, in which they are written; None: they are not.
+        inputs: The data of the identification.
+        again: The command that continues from ``partial.json``.
         table: The parameters of the search.
         z: Shape ``(P,)``; None before the first evaluation.
         done: Phase -> completed share.
-        files: Where they are written; None: nowhere.
         ended: Whether the stage has ended; a thread that still computes records nothing.
     """
 
-    table: ParameterTable | None = None
+    folder: Path | None = None
+    inputs: Inputs | None = None
+    again: str = ""
+    table: ParameterTable = field(default_factory=lambda: ParameterTable([]))
     z: np.ndarray | None = None
-    loss: float = float("inf")
-    done: dict[str, float] = field(default_factory=lambda: {"search": 0.0, "refine": 0.0})
-    files: FitFiles | None = None
+    loss: float = np.inf
+    done: dict[str, float] = field(default_factory=dict)
     ended: bool = False
+    _problem: Problem | None = None
+    _shown: float = np.inf
+    _next_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.restart(self.table)
 
     def restart(self, table: ParameterTable) -> None:
         """Begin a search of other parameters."""
-        self.table, self.z, self.loss, self.done = table, None, float("inf"), {"search": 0.0, "refine": 0.0}
+        self.table, self.z, self.loss, self.done = table, None, np.inf, {"search": 0.0, "refine": 0.0}
 
     def begin(self, problem: Problem) -> None:
         """Take the problem of the next search."""
-        if self.files:
-            self.files.begin(problem)
+        self._problem, self._shown = problem, np.inf
 
     def advance(self, stage: str, share: float, loss: float, z: np.ndarray) -> None:
         """Record progress; the first result of a refinement replaces that of the search, even with a larger loss.
@@ -74,8 +83,15 @@ class Best:
         if loss < self.loss or (stage == "refine" and not self.done["refine"]):
             self.z, self.loss = np.array(z), loss
         self.done[stage] = min(1.0, self.done[stage] + share)
-        if self.files:
-            self.files.show(self)
+        if self.folder is None or self.inputs is None or self.z is None or not np.isfinite(self.loss):
+            return
+        # A viewer shows the loss, and the best fit if it is better than the one before.
+        write_progress(self.folder, {"loss": self.loss})
+        config, problem, now_s = self.inputs.config, self._problem, time.monotonic()
+        if config.view is not None and problem is not None and self.loss < self._shown and now_s >= self._next_s:
+            values = {"identified": problem.table.decode(self.z)}
+            write_best_fit(self.folder, samples(problem, values, config.settle_s))
+            self._shown, self._next_s = self.loss, time.monotonic() + _PERIOD_S
 
     def fitted(self, z: np.ndarray, loss: float) -> None:
         """Record the finished fit, which is written before the longer judgement begins.
@@ -84,13 +100,13 @@ class Best:
             z: Shape ``(P,)``: the estimate.
         """
         self.z, self.loss, self.done = np.array(z), loss, {"search": 1.0, "refine": 1.0}
-        if self.files:
-            self.files.keep(self)
+        self.write()
 
-    def unfinished(self, inputs: Inputs, run_dir: Path, again: str) -> Identification:
-        """Return the best values as an identification with the verdict ``not finished``, without intervals."""
-        table = self.table or ParameterTable([])
-        values = {name: np.ravel(value) for name, value in as_numbers(table, np.asarray(self.z)).items()}
+    def write(self) -> None:
+        """Write the best values as an identification with the verdict ``not finished``, without intervals."""
+        if self.folder is None or self.inputs is None or self.z is None:
+            return
+        values = {name: np.ravel(value) for name, value in as_numbers(self.table, self.z).items()}
         done = ", ".join(f"{share:.0%} of {what}" for what, share in self.done.items())
         reason = f"it ended after {done}: these values have no intervals and were not judged on held-out data"
         rows = [
@@ -105,60 +121,28 @@ class Best:
                 upper=p.high,
                 verdict="not determined" if p.free else "fixed",
             )
-            for p in table
+            for p in self.table
             for i, value in enumerate(values[p.name])
         ]
-        return Identification(
-            pipeline=inputs.loaded.name,
-            logs=inputs.sources(run_dir),
-            verdict=Judgement("not finished", (reason,), again),
+        Identification(
+            pipeline=self.inputs.loaded.name,
+            logs=self.inputs.sources(self.folder.parent),
+            verdict=Judgement("not finished", (reason,), self.again),
             parameters=tuple(rows),
             search=Search(loss=self.loss, done=self.done),
-        )
-
-
-class FitFiles:
-    """The files of a fit in its stage's folder.
-
-    Args:
-        again: Path of ``partial.json`` -> the command that continues from it.
-    """
-
-    def __init__(self, stage: OpenStage, inputs: Inputs, again: Callable[[Path], str]) -> None:
-        self.path = stage.folder / PARTIAL
-        self.again = again(self.path)
-        self._stage, self._inputs = stage, inputs
-        self._problem: Problem | None = None
-        self._loss, self._next_s = np.inf, 0.0
-
-    def begin(self, problem: Problem) -> None:
-        """Take the problem of the next search."""
-        self._problem, self._loss = problem, np.inf
-
-    def show(self, best: Best) -> None:
-        """Write the loss and, beside a viewer, the best fit if it is better than the one before."""
-        if best.z is None or not np.isfinite(best.loss):
-            return
-        write_progress(self._stage.folder, {"loss": best.loss})
-        config, problem, now_s = self._inputs.config, self._problem, time.monotonic()
-        if config.view is not None and problem is not None and best.loss < self._loss and now_s >= self._next_s:
-            values = {"identified": problem.table.decode(best.z)}
-            write_best_fit(self._stage.folder, samples(problem, values, config.settle_s))
-            self._loss, self._next_s = best.loss, time.monotonic() + _PERIOD_S
-
-    def keep(self, best: Best) -> None:
-        """Write the best values."""
-        best.unfinished(self._inputs, self._stage.run_dir, self.again).write(self.path)
+        ).write(self.folder / PARTIAL)
 
 
 @contextmanager
-def kept(stage: OpenStage, inputs: Inputs, again: Callable[[Path], str]) -> Iterator[Best]:
+def kept(stage: OpenStage, inputs: Inputs, again: str) -> Iterator[Best]:
     """Yield the record of the best values, with its files in the stage's folder, beside a viewer if one is configured.
 
     ``partial.json`` is an output of the stage if a signal ends it, or an error after the fit. A judgement removes it.
+
+    Args:
+        again: The command that continues from it.
     """
-    files = FitFiles(stage, inputs, again)
-    best, path = Best(files=files), files.path
+    best, path = Best(stage.folder, inputs, again), stage.folder / PARTIAL
     try:
         with live_view(inputs.config.view, stage.folder, f"identify {stage.run_dir.name}", dict):
             yield best
@@ -166,11 +150,11 @@ def kept(stage: OpenStage, inputs: Inputs, again: Callable[[Path], str]) -> Iter
         best.ended = True
         signalled = isinstance(error, KeyboardInterrupt | SystemExit)
         if best.z is not None and np.isfinite(best.loss) and (signalled or path.exists()):
+            best.write()
             stage.output("partial", PARTIAL)
-            files.keep(best)
             ended = "interrupted: the best values so far" if signalled else "the judgement failed: the fitted values"
             note(f"{ended} are in {shown(path)}, without intervals and verdict")
-            note(f"next: {files.again}")
+            note(f"next: {again}")
         raise
     best.ended = True
     path.unlink(missing_ok=True)

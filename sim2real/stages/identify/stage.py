@@ -19,7 +19,7 @@ from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.identify.fitting import fit_model
 from sim2real.stages.identify.inputs import Inputs, configured, prepare, storing_refits
 from sim2real.stages.identify.judgement import judge
-from sim2real.stages.identify.progress import Best, kept
+from sim2real.stages.identify.progress import PARTIAL, Best, kept
 from sim2real.stages.identify.show import show, summary
 from sim2real.stages.load import AnyRobot, defaults_of, robot_of
 from sim2real.stages.pipeline.open_log import open_recording
@@ -101,7 +101,7 @@ def run(robot: RecordedRobot, config: IdentifyConfig, root: Path, run_dir: Path 
     with (
         open_stage(root, robot.name, "identify", config, files, run_dir) as stage,
         storing_refits(inputs, stage.folder, root) as inputs,
-        kept(stage, inputs, lambda file: continuing(robot, config, root, file)) as best,
+        kept(stage, inputs, continuing(robot, config, root, stage.folder / PARTIAL)) as best,
     ):
         identification = _identify(inputs, best)
         if inputs.refits.stored:
