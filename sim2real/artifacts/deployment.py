@@ -24,7 +24,7 @@ from sim2real.artifacts.summary import ArtifactTable, Interval, Shown, words_and
 from sim2real.log.schema import unit_of
 from sim2real.types import Json
 
-FORMAT = 2
+FORMAT = 3
 RESULT, SIMULATION = "result.json", "simulation.npz"
 PROBE = "probe.mcap"
 """Log of the small steps that measure the delay before the episodes."""
@@ -164,28 +164,6 @@ class Drift:
 
 
 @dataclass(frozen=True)
-class Course:
-    """One measured column over a whole episode, compared with all simulations of the same policy.
-
-    Attributes:
-        beside: The 0.9 quantile of the distance between the column and the band of all simulations within 0.1 s;
-            angles on the circle.
-        moved: Range of the column in the first and in the second half of the episode.
-        least: Smallest range of any simulation in each half.
-        most: Largest range of any simulation in each half.
-        paused_s: Time that the nodes lost in steps of at least two periods [s]; simulations have no such steps.
-    """
-
-    episode: int
-    column: str
-    beside: float
-    moved: tuple[float, ...]
-    least: tuple[float, ...]
-    most: tuple[float, ...]
-    paused_s: float = 0.0
-
-
-@dataclass(frozen=True)
 class Advice:
     """The verdict on a deployment, and the next command.
 
@@ -210,7 +188,6 @@ class Deployment(Shown):
         probe: Log of the small steps that measure the delay; None if the delay was not measured.
         trained: Times on the robot, and the times that the policy was trained with.
         replay: Prediction errors of the identified and of the nominal model on the recorded commands.
-        courses: Measured columns over whole episodes, compared with the simulations.
         drift: Test for parameters that have changed since the identification; None if it did not run.
         advice: The verdict; None in older files and after a dry run.
         dry_run: Whether commands were not sent: then there are no scores, no simulation and no gap.
@@ -225,7 +202,6 @@ class Deployment(Shown):
     probe: Recording | None = None
     trained: tuple[Gap, ...] = ()
     replay: tuple[Replay, ...] = ()
-    courses: tuple[Course, ...] = ()
     drift: Drift | None = None
     advice: Advice | None = None
     dry_run: bool = False

@@ -9,13 +9,14 @@ from sim2real.artifacts.deployment import Advice, Deployment, Drift
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.run import MANIFEST
 from sim2real.robots.robot import RecordedRobot, in_world
-from sim2real.stages.deploy.trajectories import PAUSED
 from sim2real.stages.load import defaults_of
 from sim2real.stages.shared.identification import command
 from sim2real.stages.terminal.console import shown
 
 LATER = "take longer than"
 """Words of the reason for new timing in training."""
+PAUSED = "to pauses of its nodes"
+"""Words of the reason for another deployment."""
 ENOUGH_S = 12.0
 """Length of a deployment's logs that suffices to identify from [s]."""
 

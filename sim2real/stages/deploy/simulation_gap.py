@@ -20,7 +20,6 @@ from sim2real.installation import has_jax
 from sim2real.log.session import input_ages
 from sim2real.robots.loop import ACTUATOR, AGENT, SENSOR, WORLD
 from sim2real.robots.robot import Robot, as_columns, as_sent
-from sim2real.stages.deploy.trajectories import courses, lost_s
 from sim2real.stages.terminal.console import progress
 from sim2real.stages.terminal.interruption import patiently
 
@@ -41,7 +40,7 @@ def compare(
     """Return the scores of a deployment beside those of simulations of the same policy.
 
     Scores compare states of one kind: true states if every recording has them, else states as the sensor measures
-    them. Trajectories always compare measured states.
+    them.
 
     Args:
         identification: Parameters of the simulations; None: none, except for a robot that is simulated in plain
@@ -78,16 +77,12 @@ def compare(
     scored = None if simulated is None else [states for states, _ in simulated]
     measured = [] if simulated is None else [states for _, states in simulated]
 
-    # Compare scores, ages and trajectories. The page shows the first simulation of each episode.
+    # Compare scores and ages. The page shows the first simulation of each episode.
     scores, gap = _scored(robot.task.score, real, scored)
     gap += _age_rows([r.episode for r in recordings], timeline)
     columns = [{"t": t, **states} for t, states in measured[: len(recordings)]]
     columns += [{}] * (len(recordings) - len(columns))
-    sensed = [(r.episode.steps[SENSOR].begun_s, _sensed(r.episode)) for r in recordings]
-    nodes = (SENSOR, AGENT, ACTUATOR)
-    trajectories = courses(sensed, measured, robot.units, [lost_s(r.episode, nodes) for r in recordings])
-    units = dict(robot.units)
-    return Deployment(scores, tuple(gap), units, tuple(columns), tuple(recordings), courses=trajectories)
+    return Deployment(scores, tuple(gap), dict(robot.units), tuple(columns), tuple(recordings))
 
 
 def _states(recording: Recording, robot: Robot, use_truth: bool) -> States:

@@ -10,12 +10,12 @@ import numpy as np
 from sim2real.artifacts.bundle import GOOD_SUCCESS, Bundle
 from sim2real.artifacts.deployment import AS_HERE, Advice, Changed, Deployment, Drift, Gap, Replay
 from sim2real.artifacts.identification import MAX_ERROR_RATIO, ROUND_TRIP, Identification
+from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import OtherMotion, Sim2RealError
 from sim2real.installation import has_jax
 from sim2real.robots.robot import RecordedRobot
-from sim2real.stages.deploy.next_command import LATER, with_command
-from sim2real.stages.deploy.trajectories import longest_pause, off_course
+from sim2real.stages.deploy.next_command import LATER, PAUSED, with_command
 from sim2real.stages.terminal.console import progress, shown
 from sim2real.stages.terminal.interruption import patiently
 
@@ -28,7 +28,8 @@ _MAX_LATE_SHARE = 0.01
 """Largest share of steps that may take longer than the longest step of training."""
 _LATENESS_PERIODS = 0.1
 """A step is late if it exceeds the longest of training by this share of the policy's period."""
-_MAX_REASONS = 3
+_MAX_PAUSES_S = 0.1
+"""Longest time that an episode may lose in pauses; a policy that then fails is not judged."""
 _MAX_SUCCESS_GAP = 0.1
 """Largest difference of success in simulation and on the robot."""
 
@@ -85,26 +86,37 @@ def judge(
 def verdict(deployment: Deployment, bundle: Bundle) -> Advice:
     """Return the verdict on a deployment, without the next command.
 
-    The first finding decides: a wrong model, see ``model_advice``; episodes that differ from their simulations; a
-    policy that was trained for other times, or that does not succeed often enough.
+    The first finding decides: a wrong model, see ``model_advice``; a policy that was trained for other times, or that
+    does not succeed often enough. A change of a parameter is no reason to identify again while the policy succeeds and
+    all predictions are within their expected errors.
 
     Args:
-        deployment: With replay, courses, drift and times.
+        deployment: With replay, drift and times.
     """
-    if advice := model_advice(deployment.replay, deployment.drift):
-        return advice
-    horizon_s = max((row.horizon_s for row in deployment.replay), default=0.0)
-    holds = f"commands played again hold {horizon_s:g} s ahead, though"
-    if differences := tuple(off_course(deployment, paused=False)):
-        return Advice("re-identify", (*differences[:_MAX_REASONS], holds))
-    if differences := tuple(off_course(deployment, paused=True)):
-        # The model is not to blame. If such steps are frequent, training needs them too.
-        late = _late_nodes(deployment, bundle)
-        reasons = (longest_pause(deployment), *differences[:_MAX_REASONS], holds)
-        return Advice("re-train" if late else "not judged", (*late, *reasons))
-    if advice := _policy_advice(deployment, bundle):
-        return replace(advice, reasons=(*advice.reasons, "the model holds"))
-    return Advice("fine", ("the robot is the one that was identified, and as fast as in training",))
+    model, policy = model_advice(deployment.replay, deployment.drift), _policy_advice(deployment, bundle)
+    holds = all(r.expected is not None and _error_ratio(r, "identified") <= 1.0 for r in deployment.replay)
+    if model is not None and model.status == "re-identify" and holds and policy is None:
+        return Advice("fine", ("the policy succeeds and the model's errors are the expected ones", *model.reasons))
+    if model is not None:
+        return model
+    if policy is None:
+        return Advice("fine", ("the robot is the one that was identified, and as fast as in training",))
+    if (lost_s := max(map(_lost_s, deployment.recordings), default=0.0)) > _MAX_PAUSES_S:
+        pause = f"an episode lost {lost_s:.2g} s {PAUSED}, and no simulation has such pauses"
+        return replace(policy, status="not judged", reasons=(pause, *policy.reasons, "the model holds"))
+    return replace(policy, reasons=(*policy.reasons, "the model holds"))
+
+
+def _lost_s(recording: Recording) -> float:
+    """Return the time that the slowest node of an episode lost in steps of two periods or more [s]."""
+    lost_s = [0.0]
+    for steps in recording.episode.steps.values():
+        # A step that is a little late is no pause: the node returns to its schedule.
+        gaps_s = np.diff(steps.begun_s)
+        if gaps_s.size:
+            period_s = float(np.median(gaps_s))
+            lost_s.append(float(np.sum(gaps_s[gaps_s >= 2.0 * period_s] - period_s)))
+    return max(lost_s)
 
 
 def model_advice(replay: Sequence[Replay], drift: Drift | None) -> Advice | None:
