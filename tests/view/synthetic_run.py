@@ -209,7 +209,7 @@ def result(simulated: bool = True) -> dict[str, Any]:
         {"quantity": q, "real": v, "simulation": model[q] if model else None, "gap": v - model[q] if model else None}
         for q, v in real.items()
     ]
-    return {"format": 2, "episodes": [{"real": real, "simulation": model}] * 2, "gap": rows}
+    return {"format": 3, "episodes": [{"real": real, "simulation": model}] * 2, "gap": rows}
 
 
 def simulation() -> dict[str, np.ndarray]:
