@@ -32,7 +32,7 @@ def found(tmp_path, angle, fix=None):
     robot = MjcfRobot(config)
     values = {p.name: KP if p.name.startswith("kp") else p.nominal for p in robot.identifiable(0.02).parameters}
     inputs = SimpleNamespace(
-        pipeline=SimpleNamespace(load=lambda: robot),
+        loaded=robot,
         config=IdentifyConfig(max_delay_s=0.02, settle_s=0.1, horizon_s=0.5, fix=fix or {}),
         episodes=[episode],
         fitted=1,
