@@ -19,7 +19,7 @@ from sim2real.artifacts.run import newest
 from sim2real.artifacts.summary import ArtifactTable, Shown
 from sim2real.errors import NotInstalled, Sim2RealError, UsageError
 from sim2real.graph.episode import Episode
-from sim2real.identification.model import Channel, IdentifiableModel, measured_channels, position_of
+from sim2real.identification.model import IdentifiableModel, measured_channels, position_of
 from sim2real.identification.parameters import ParameterTable
 from sim2real.identification.segments import Span, check_log
 from sim2real.installation import has_jax
@@ -49,45 +49,28 @@ _STILL = 0.05
 _NOISE_ORDER = 6
 """Differences of this order keep 0.2 % of a motion at a tenth of the sampling rate, and all white noise."""
 _WINDOW_S = 0.03
-_SHORT_S = 12.0
-_LEAST_MOVING, _ONE_SIDED = 0.3, 0.2
+_SHORT_S, _LEAST_MOVING, _ONE_SIDED = 12.0, 0.3, 0.2
 
 
 @dataclass(frozen=True)
-class Motion:
-    """The time in motion of a joint.
+class SignalCoverage:
+    """What a recording covers of a joint's position, or of a command.
 
     Attributes:
-        moving: Share of the time in motion.
-        forward: Share of that time in which the position increases.
-        reversals: Number of changes of direction.
+        fastest: The highest speed of a joint.
+        moving: Share of the time in which a joint moves.
+        forward: Share of that time in which its position increases.
+        reversals: Number of its changes of direction.
     """
 
-    moving: float
-    forward: float
-    reversals: int
-
-
-@dataclass(frozen=True)
-class JointCoverage:
-    """The range of a joint's position, its highest speed, and its time in motion."""
-
     name: str
     unit: str
     low: float
     high: float
-    fastest: float
-    motion: Motion
-
-
-@dataclass(frozen=True)
-class CommandCoverage:
-    """The range of a command."""
-
-    name: str
-    unit: str
-    low: float
-    high: float
+    fastest: float | None = None
+    moving: float = 0.0
+    forward: float = 0.0
+    reversals: int = 0
 
 
 @dataclass(frozen=True)
@@ -108,22 +91,22 @@ class Coverage:
     rate_hz: float
     gaps: int
     longest_gap_s: float
-    joints: tuple[JointCoverage, ...] = ()
-    commands: tuple[CommandCoverage, ...] = ()
+    joints: tuple[SignalCoverage, ...] = ()
+    commands: tuple[SignalCoverage, ...] = ()
     about_torque: tuple[str, ...] = ()
 
     def problems(self) -> Iterator[str]:
         """Yield a sentence for each reason why this recording determines little."""
         if self.gaps:
             yield f"{self.gaps} gaps in the measurements, the longest {self.longest_gap_s:.3g} s"
-        for name, m in ((joint.name, joint.motion) for joint in self.joints):
-            if not m.moving:
-                yield f"{name} does not move at all: nothing about it is determined"
+        for joint in self.joints:
+            if not joint.moving:
+                yield f"{joint.name} does not move at all: nothing about it is determined"
                 continue
-            if m.moving < _LEAST_MOVING:
-                yield f"{name} moves {m.moving:.0%} of the time: excite it more, or for longer"
-            if not _ONE_SIDED < m.forward < 1 - _ONE_SIDED:
-                yield f"{name} moves almost only one way: friction and an offset then look alike"
+            if joint.moving < _LEAST_MOVING:
+                yield f"{joint.name} moves {joint.moving:.0%} of the time: excite it more, or for longer"
+            if not _ONE_SIDED < joint.forward < 1 - _ONE_SIDED:
+                yield f"{joint.name} moves almost only one way: friction and an offset then look alike"
         yield from self.about_torque
         if self.commands and all(c.high == c.low for c in self.commands):
             yield "no command changes: gains and delays of the actuator are not determined"
@@ -131,17 +114,15 @@ class Coverage:
     def show(self) -> None:
         """Print the sampling, the motion of the joints and the ranges of the commands."""
         gaps = f"{self.gaps}, the longest {self.longest_gap_s:.3g} s" if self.gaps else "none"
-        sampling = f"{self.samples} samples in {self.duration_s:.1f} s, {self.rate_hz:.4g} Hz, gaps: {gaps}"
-        rows = [
-            [
-                *(j.name, f"{j.low:.3g} to {j.high:.3g} {j.unit}".rstrip(), f"{j.fastest:.3g}"),
-                *(f"{j.motion.moving:.0%}", f"{j.motion.forward:.0%}", j.motion.reversals),
-            ]
-            for j in self.joints
-        ]
-        rows += [[c.name, f"{c.low:.3g} to {c.high:.3g} {c.unit}".rstrip(), "", "", "", ""] for c in self.commands]
+        sampled = f"{self.samples} samples in {self.duration_s:.1f} s, {self.rate_hz:.4g} Hz, gaps: {gaps}"
+        rows = []
+        for s in (*self.joints, *self.commands):
+            of_joint = ["", "", "", ""]
+            if s.fastest is not None:
+                of_joint = [f"{s.fastest:.3g}", f"{s.moving:.0%}", f"{s.forward:.0%}", s.reversals]
+            rows.append([s.name, f"{s.low:.3g} to {s.high:.3g} {s.unit}".rstrip(), *of_joint])
         table = ArtifactTable(("signal", "range", "highest speed", "in motion", "of it upwards", "reversals"), rows)
-        print(f"{pairs({self.name: sampling})}\n\n{artifact_table(table)}\n")
+        print(f"{pairs({self.name: sampled})}\n\n{artifact_table(table)}\n")
 
 
 @dataclass(frozen=True)
@@ -175,7 +156,6 @@ class Checked(Shown):
         source: ``log``, or ``planned excitation``.
         segments: Number of simulated segments.
         segment_s: Length of a segment [s].
-        condition: Condition number of the Jacobian, its columns in widths of the bounds; None if it is infinite.
         undetermined: Groups of parameters; only combinations of the parameters in a group are determined.
         messages: A sentence for each group.
         following: The command to run next.
@@ -186,7 +166,6 @@ class Checked(Shown):
     recordings: tuple[Coverage, ...]
     segments: int
     segment_s: float
-    condition: float | None
     undetermined: tuple[tuple[str, ...], ...]
     messages: tuple[str, ...]
     parameters: tuple[ParameterCheck, ...]
@@ -261,8 +240,6 @@ def run(robot: RecordedRobot, config: CheckConfig) -> bool:
     for recording in checked.recordings:
         recording.show()
     print(artifact_table(checked.rows()))
-    condition = "infinite" if checked.condition is None else f"{checked.condition:.2g}"
-    print(f"\n{pairs({'condition number': condition, 'directions left open': len(checked.undetermined)})}")
     return checked.determined
 
 
@@ -386,27 +363,26 @@ def coverage(name: str, episode: Episode, model: IdentifiableModel, units: Mappi
         model: Names the nodes and fields that are compared.
         units: Field -> unit.
     """
-    begun_s = episode.steps[model.sensor].begun_s
-    gaps, longest_s, rate_hz = sampling(begun_s)
+    begun_s, fields = np.asarray(episode.steps[model.sensor].begun_s), dict(units)
+    joints = []
+    for channel in model.channels:
+        outputs = episode.outputs[model.sensor]
+        position = np.asarray(channel.of(outputs[channel.position]), np.float64)
+        # A robot that does not measure velocities gets them from differences of positions.
+        velocity = speed(begun_s, position) if channel.velocity is None else channel.of(outputs[channel.velocity])
+        ends = (float(position.min()), float(position.max()), float(np.abs(velocity).max()))
+        unit = unit_of(position_of(channel), fields)
+        joints.append(SignalCoverage(channel.name, unit, *ends, *motion_of(begun_s, position)))
     duration_s = float(begun_s[-1] - begun_s[0]) if len(begun_s) else 0.0
-    joints = tuple(_joint(c, episode.outputs[model.sensor], units, begun_s) for c in model.channels)
-    doubts = tuple(about_torque(episode.metadata.get("mapping") or {}))
-    commands = tuple(_commands(episode, model, units))
-    return Coverage(name, len(begun_s), duration_s, rate_hz, gaps, longest_s, joints, commands, doubts)
+    gaps, longest_s, rate_hz = sampling(begun_s)
+    return Coverage(
+        *(name, len(begun_s), duration_s, rate_hz, gaps, longest_s, tuple(joints)),
+        commands=tuple(_commands(episode, model, fields)),
+        about_torque=tuple(about_torque(episode.metadata.get("mapping") or {})),
+    )
 
 
-def _joint(
-    channel: Channel, outputs: Mapping[str, np.ndarray], units: Mapping[str, str], begun_s: np.ndarray
-) -> JointCoverage:
-    position = np.asarray(channel.of(outputs[channel.position]), np.float64)
-    # A robot that does not measure velocities gets them from differences of positions.
-    velocity = speed(begun_s, position) if channel.velocity is None else channel.of(outputs[channel.velocity])
-    low, high, fastest = float(position.min()), float(position.max()), float(np.abs(velocity).max())
-    unit = unit_of(position_of(channel), dict(units))
-    return JointCoverage(channel.name, unit, low, high, fastest, motion_of(begun_s, position))
-
-
-def _commands(episode: Episode, model: IdentifiableModel, units: Mapping[str, str]) -> Iterator[CommandCoverage]:
+def _commands(episode: Episode, model: IdentifiableModel, units: dict[str, str]) -> Iterator[SignalCoverage]:
     """Yield each command, named by its joint where the field has a value for each joint."""
     for node, message in model.given.items():
         for field in pytree.leaves(message):
@@ -418,8 +394,8 @@ def _commands(episode: Episode, model: IdentifiableModel, units: Mapping[str, st
             elif len(columns) == len(model.channels):
                 names = [f"{field} of {channel.name}" for channel in model.channels]
             for i, (name, column) in enumerate(zip(names, columns, strict=True)):
-                low, high = float(column.min()), float(column.max())
-                yield CommandCoverage(name, unit_of(f"{field}[{i}]", dict(units)), low, high)
+                unit = unit_of(f"{field}[{i}]", units)
+                yield SignalCoverage(name, unit, float(column.min()), float(column.max()))
 
 
 def sampling(t_s: np.ndarray) -> tuple[int, float, float]:
@@ -441,45 +417,39 @@ def speed(t_s: np.ndarray, position: np.ndarray) -> np.ndarray:
     return np.gradient(np.asarray(position, np.float64), times[0] + np.concatenate([[0.0], np.cumsum(steps)]))
 
 
-def motion(velocity: np.ndarray, sigma: float = 0.0) -> Motion:
-    """Return the motion of a joint with velocities ``(N,)`` and their deviation."""
-    velocity = np.asarray(velocity, np.float64)
-    # Compare with the 99 % quantile: a rare spike must not make the other speeds count as standing still.
-    still = max(_STILL * float(np.quantile(np.abs(velocity), 0.99)), 3.0 * sigma)
-    fast = np.abs(velocity) > still
-    if not fast.any():
-        return Motion(0.0, 0.0, 0)
-    signs = np.sign(velocity[fast])
-    return Motion(float(fast.mean()), float((signs > 0).mean()), int((np.diff(signs) != 0).sum()))
+def motion_of(t_s: np.ndarray, position: np.ndarray) -> tuple[float, float, int]:
+    """Return the share of the time in motion, the share of it upwards, and the number of reversals of a joint.
 
+    Speeds are those of positions averaged over 30 ms, so that the noise of fast samples does not hide slow motion;
+    noise, glitches and quantisation are no motion.
 
-def motion_of(t_s: np.ndarray, position: np.ndarray) -> Motion:
-    """Return the motion of a joint with positions ``(N,)`` at times ``(N,)`` [s]; noise and quantisation do not count.
-
-    Speeds are those of positions averaged over 30 ms, so that the noise of fast samples does not hide slow motion.
+    Args:
+        t_s: Times ``(N,)`` [s].
+        position: Positions ``(N,)``.
     """
     t_s, position = np.asarray(t_s, np.float64), np.asarray(position, np.float64)
     good = np.isfinite(position) & np.isfinite(t_s)
-    t_s, position = t_s[good], position[good]
-    if len(position) < 3 * _NOISE_ORDER:
-        return motion(speed(t_s, position))
-    period_s = max(float(np.median(np.diff(t_s))), 1e-9)
-    # Average over 30 ms.
-    width = min(max(1, round(_WINDOW_S / period_s)), len(position) // 3)
-    mean = np.full(width, 1.0 / width)
-    deviation = _noise(position)
-    times, smooth = (np.convolve(values, mean, "valid") for values in (t_s - t_s[0], position))
-    # Compare the range of the averages with the noise and the steps of the readings.
-    least = max(1.5 * float(np.diff(np.unique(position)).min(initial=np.inf)), 8.0 * deviation / np.sqrt(width))
-    if not np.ptp(np.quantile(smooth, [0.005, 0.995])) > least:
-        return Motion(0.0, 0.0, 0)
-    return motion(speed(times, smooth), deviation / (width * period_s))
-
-
-def _noise(values: np.ndarray) -> float:
-    """Return the deviation of white noise in values ``(N,)``, by high differences without the largest 2 %: leaps."""
-    squares = np.sort(np.diff(values, _NOISE_ORDER) ** 2)
-    return float(np.sqrt(squares[: math.ceil(0.98 * squares.size)].mean() / math.comb(2 * _NOISE_ORDER, _NOISE_ORDER)))
+    t_s, position, noise = t_s[good], position[good], 0.0
+    if len(position) >= 3 * _NOISE_ORDER:
+        # The deviation of white noise, by high differences without the largest 2 %, which are leaps.
+        squares = np.sort(np.diff(position, _NOISE_ORDER) ** 2)[: math.ceil(0.98 * (len(position) - _NOISE_ORDER))]
+        noise = float(np.sqrt(squares.mean() / math.comb(2 * _NOISE_ORDER, _NOISE_ORDER)))
+        width = min(max(1, round(_WINDOW_S / max(float(np.median(np.diff(t_s))), 1e-9))), len(position) // 3)
+        # Compare the range of the averages with the noise and the steps of the readings.
+        least = max(1.5 * float(np.diff(np.unique(position)).min(initial=np.inf)), 8.0 * noise / np.sqrt(width))
+        mean = np.full(width, 1.0 / width)
+        noise /= width * max(float(np.median(np.diff(t_s))), 1e-9)
+        t_s, position = (np.convolve(values, mean, "valid") for values in (t_s - t_s[0], position))
+        if not np.ptp(np.quantile(position, [0.005, 0.995])) > least:
+            return 0.0, 0.0, 0
+    velocity = speed(t_s, position)
+    # Compare with the 99 % quantile: a rare spike must not make the other speeds count as standing still.
+    still = max(_STILL * float(np.quantile(np.abs(velocity), 0.99)), 3.0 * noise) if velocity.size else 0.0
+    fast = np.abs(velocity) > still
+    if not fast.any():
+        return 0.0, 0.0, 0
+    signs = np.sign(velocity[fast])
+    return float(fast.mean()), float((signs > 0).mean()), int((np.diff(signs) != 0).sum())
 
 
 def determine(
@@ -502,7 +472,7 @@ def determine(
         for c, error in zip(problem.table.columns, errors, strict=True)
     ]
     groups = (found.undetermined, found.messages)
-    return Checked("", "log", (), problem.segments, length_s, found.condition, *groups, tuple(rows))
+    return Checked("", "log", (), problem.segments, length_s, *groups, tuple(rows))
 
 
 def cut_segments(episodes: Sequence[Episode], config: IdentifyConfig) -> tuple[list[Span], float]:
