@@ -1,12 +1,10 @@
 """What ``import sim2real`` offers, as a notebook and ``help`` show it."""
 
-import importlib
 import inspect
 import pydoc
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
@@ -32,25 +30,6 @@ def test_help_and_signature_are_those_of_the_function(name):
     text = pydoc.render_doc(function, renderer=pydoc.plaintext)
     assert f"function {name} in module" in text
     assert "Args:" in text
-
-
-@pytest.mark.parametrize("room", ["identify"])
-def test_a_room_stays_importable_beside_the_function_of_its_name(room):
-    """In whatever order: importing a module of a room sets the room as the package's attribute, if nothing keeps it."""
-    module = "parameters"
-    code = f"""
-import sim2real
-import sim2real.{room}.{module}
-from sim2real.{room} import {module} as found
-import sim2real.{room}.{module} as named
-assert callable(sim2real.{room}) and named is found is sim2real.{room}.{module}
-import sim2real.{room}.config
-from sim2real import {room}
-assert {room}.config is sim2real.{room}.config
-"""
-    subprocess.run([sys.executable, "-c", code], check=True)
-    assert isinstance(importlib.import_module(f"sim2real.{room}"), ModuleType)
-    assert not isinstance(getattr(sim2real, room), ModuleType)
 
 
 def test_a_name_that_does_not_exist_is_an_attribute_error():

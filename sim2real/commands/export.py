@@ -76,7 +76,7 @@ def find_parameters(source: str, runs: Path) -> Path:
     """Return the file of the identification that a text names: a file, a stage folder, a pipeline or a run."""
     from sim2real.artifacts.identification import PARAMETERS
     from sim2real.artifacts.run import newest, pipeline_of
-    from sim2real.stages.pipeline.find_run import find_run, warn_of_stale
+    from sim2real.stages.shared.find_run import find_run, warn_of_stale
 
     path = Path(source)
     if path.is_file():
@@ -98,7 +98,7 @@ def find_bundle(source: str, runs: Path) -> Path:
     from sim2real.artifacts.run import newest, pipeline_of
     from sim2real.errors import Sim2RealError
     from sim2real.policy.bundle import CONTRACT
-    from sim2real.stages.pipeline.find_run import find_run, warn_of_stale
+    from sim2real.stages.shared.find_run import find_run, warn_of_stale
 
     for folder in (Path(source), Path(source) / BUNDLE):
         if (folder / CONTRACT).is_file():

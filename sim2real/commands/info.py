@@ -16,7 +16,7 @@ from sim2real.installation import has_jax
 from sim2real.runtime import compilation_cache
 from sim2real.stages.flag import Flag
 from sim2real.stages.load import available, defaults_of, folder_of, load_robot, summary_of
-from sim2real.stages.pipeline.find_run import find_run
+from sim2real.stages.shared.find_run import find_run
 from sim2real.stages.terminal.console import pairs, shown, table
 
 

@@ -16,7 +16,7 @@ from sim2real.errors import ERROR, UsageError
 from sim2real.runtime import compilation_cache
 from sim2real.stages.flag import Flag
 from sim2real.stages.load import available, defaults_of, load_module, load_robot
-from sim2real.stages.pipeline.robot_flags import RobotFlags
+from sim2real.stages.shared.robot_flags import RobotFlags
 
 if TYPE_CHECKING:
     from sim2real.log.importing.mapping import ImportMapping
@@ -120,7 +120,7 @@ def run(config: NewConfig) -> bool:
     from sim2real.robots.model.file import read_model
     from sim2real.robots.model.parameters import expand
     from sim2real.stages.config import MODEL_IDENTIFY
-    from sim2real.stages.pipeline.from_model import files_of, note_held
+    from sim2real.stages.shared.from_model import files_of, note_held
     from sim2real.stages.terminal.console import note, wrote
 
     example = "sim2real new go2 --mjcf go2.xml --log run.csv"
@@ -161,7 +161,7 @@ def _described(config: NewConfig) -> "tuple[RobotConfig, ImportMapping | None]":
     from sim2real.robots.model.drives import joints_of
     from sim2real.robots.model.file import read_model
     from sim2real.robots.model.robot import RobotConfig
-    from sim2real.stages.pipeline.from_model import describe, describe_robot
+    from sim2real.stages.shared.from_model import describe, describe_robot
 
     if config.log is not None:
         found = describe_robot(config.robot, [config.log])

@@ -13,7 +13,7 @@ from sim2real.errors import UsageError
 from sim2real.stages.flag import Flag
 from sim2real.stages.live.config import WINDOW, is_viewer
 from sim2real.stages.load import available
-from sim2real.stages.pipeline.find_run import find_run
+from sim2real.stages.shared.find_run import find_run
 
 if TYPE_CHECKING:
     from sim2real.artifacts.comparison import Comparison
@@ -93,7 +93,7 @@ def report(run: str | Path | Run, runs: str | Path = "runs") -> Path:
     Returns:
         The page.
     """
-    from sim2real.stages.pipeline.python_arguments import folder_of
+    from sim2real.stages.shared.arguments import folder_of
     from sim2real.view.page import report as write
 
     folder = getattr(run, "folder", None)

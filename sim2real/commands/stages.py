@@ -46,7 +46,7 @@ def stage(command: str, arguments: list[str]) -> None:
     compilation_cache.enable(parsed.cache)
     run_dir = None
     if parsed.run:
-        from sim2real.stages.pipeline.find_run import find_run
+        from sim2real.stages.shared.find_run import find_run
 
         run_dir = find_run(parsed.runs, parsed.run, name)
     run_stage(command, load_robot(name), parsed.config, parsed.runs, run_dir, page=command in ("identify", "deploy"))

@@ -58,8 +58,8 @@ def robot_environment(
     from sim2real.interop.environments import RobotEnvironment
     from sim2real.robots.robot import Robot
     from sim2real.stages.load import available, defaults_of, load_robot, moving
-    from sim2real.stages.pipeline.find_run import find_run
-    from sim2real.stages.pipeline.open_parameters import open_identification
+    from sim2real.stages.shared.arguments import open_identification
+    from sim2real.stages.shared.find_run import find_run
     from sim2real.stages.train.inputs import find_parameters
     from sim2real.stages.train.trained_bundle import contract_of
     from sim2real.stages.train.training_setup import prepare

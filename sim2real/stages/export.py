@@ -24,7 +24,7 @@ from sim2real.log.reader import read_log
 from sim2real.robots.loop import SENSOR
 from sim2real.robots.robot import RecordedRobot
 from sim2real.stages.load import AnyRobot, robot_of
-from sim2real.stages.pipeline.python_arguments import AnyIdentification, AnyPath, identification_of
+from sim2real.stages.shared.arguments import AnyIdentification, AnyPath, identification_of
 from sim2real.stages.shared.identification import identified_robot
 from sim2real.stages.terminal.console import note
 from sim2real.types import Json

@@ -17,7 +17,7 @@ from sim2real.robots.model.file import read_model
 from sim2real.robots.model.parameters import ParameterPattern, usual_patterns
 from sim2real.robots.model.robot import MjcfRobot, RobotConfig
 from sim2real.stages.import_logs import stage as import_logs_stage
-from sim2real.stages.pipeline import from_model
+from sim2real.stages.shared import from_model
 
 FOUR_BAR = """<mujoco><compiler angle="radian"/><worldbody>
 <body name="crank"><joint name="crank" axis="0 1 0" damping=".01"/>

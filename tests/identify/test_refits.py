@@ -11,7 +11,7 @@ from sim2real.artifacts.identification import TriedTerm
 from sim2real.identification.held_out import REFITS, Refits
 from sim2real.stages.identify.inputs import prepare
 from sim2real.stages.load import load_robot
-from sim2real.stages.pipeline.open_log import open_recording
+from sim2real.stages.shared.arguments import open_recording
 
 ROOT = Path(__file__).parents[2]
 TERMS, PART = ("load",), "log 1, 0 to 3 s"

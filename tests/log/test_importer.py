@@ -264,7 +264,7 @@ def test_a_timeline_needs_no_connections(file):
 
 def test_identification_takes_the_log(file, tmp_path, recwarn):
     from sim2real.stages.load import load_robot
-    from sim2real.stages.pipeline.open_log import open_recording
+    from sim2real.stages.shared.arguments import open_recording
 
     robot = copy.copy(load_robot("disk"))
     robot.name, robot.units = "rig", {}

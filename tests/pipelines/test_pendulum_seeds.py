@@ -8,7 +8,7 @@ import pytest
 
 from sim2real.stages.identify.stage import identify
 from sim2real.stages.load import load_robot
-from sim2real.stages.pipeline.open_log import open_recording
+from sim2real.stages.shared.arguments import open_recording
 
 LOG = Path(__file__).parents[2] / "datasets" / "pendulum" / "chirp.mcap"
 SEEDS = range(5)

@@ -15,7 +15,7 @@ from sim2real.artifacts.timing import Timing
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.episode import Episode, Steps
 from sim2real.stages.config import DeployConfig, IdentifyConfig, TrainConfig
-from sim2real.stages.pipeline import python_arguments
+from sim2real.stages.shared import arguments
 
 FOUND = Identification(
     "pendulum",
@@ -76,10 +76,10 @@ def test_what_is_wrong_is_said_before_anything_happens(pendulum, call, said, tmp
 def test_a_dict_of_what_is_different_is_a_configuration(pendulum):
     given = {"episode_s": 2.0, "ppo": {"num_envs": 64}}
     own = replace(pendulum.defaults.train, episode_s=2.0, ppo=replace(pendulum.defaults.train.ppo, num_envs=64))
-    assert python_arguments.config_of(given, pendulum.defaults.train) == own
-    assert python_arguments.config_of(None, pendulum.defaults.train) is pendulum.defaults.train
+    assert arguments.config_of(given, pendulum.defaults.train) == own
+    assert arguments.config_of(None, pendulum.defaults.train) is pendulum.defaults.train
     with pytest.raises(UsageError):
-        python_arguments.config_of({"held_out": 2.0, "log": ()}, pendulum.defaults.identify)
+        arguments.config_of({"held_out": 2.0, "log": ()}, pendulum.defaults.identify)
 
 
 @pytest.mark.parametrize("kind", [str, Path])
@@ -87,7 +87,7 @@ def test_artifacts_are_saved_and_loaded_by_any_path(kind, tmp_path):
     folder = kind(tmp_path / "new" / "folder")
     FOUND.save(folder)
     assert Identification.load(folder).values == {"gain": 21.0494}
-    assert python_arguments.identification_of(folder).values == {"gain": 21.0494}
+    assert arguments.identification_of(folder).values == {"gain": 21.0494}
     with pytest.raises(Sim2RealError, match="there is no log"):
         Recording.load(kind(tmp_path / "none.mcap"))
     (tmp_path / "run" / "record").mkdir(parents=True)

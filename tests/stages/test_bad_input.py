@@ -10,7 +10,7 @@ from shared_run import copied
 from sim2real import cli, errors
 from sim2real.policy.bundle import sealed
 from sim2real.stages.load import load_robot
-from sim2real.stages.pipeline.open_parameters import open_identification
+from sim2real.stages.shared.arguments import open_identification
 
 
 @pytest.fixture

@@ -25,7 +25,7 @@ from sim2real.stages.config import RecordConfig
 from sim2real.stages.excitation.signals import excitation
 from sim2real.stages.excitation.simulated_log import simulate
 from sim2real.stages.load import load_robot
-from sim2real.stages.pipeline.open_log import open_recording
+from sim2real.stages.shared.arguments import open_recording
 
 LOG = Path(__file__).parents[2] / "datasets" / "pendulum" / "multisine.mcap"
 JOINT = SignalCoverage("th", "rad", -1.0, 1.0, 3.0, 0.9, 0.5, 30)

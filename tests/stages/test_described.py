@@ -11,9 +11,9 @@ from sim2real.log import read_log
 from sim2real.robots.model.parameters import ParameterPattern
 from sim2real.robots.model.robot import RobotConfig
 from sim2real.stages.load import load_robot, mapping_of
-from sim2real.stages.pipeline.from_model import describe_robot, files_of
-from sim2real.stages.pipeline.open_log import open_recording
-from sim2real.stages.pipeline.robot_flags import RobotFlags
+from sim2real.stages.shared.arguments import open_recording
+from sim2real.stages.shared.from_model import describe_robot, files_of
+from sim2real.stages.shared.robot_flags import RobotFlags
 
 XML = """<mujoco>
   <option timestep="0.002"/>

@@ -19,7 +19,7 @@ from sim2real.stages.identify import fitting
 from sim2real.stages.identify import stage as identify_stage
 from sim2real.stages.identify.progress import Best, kept
 from sim2real.stages.load import load_robot
-from sim2real.stages.pipeline.open_parameters import open_identification
+from sim2real.stages.shared.arguments import open_identification
 
 ROOT = Path(__file__).parents[2]
 LOG = ROOT / "datasets" / "pendulum" / "chirp.mcap"

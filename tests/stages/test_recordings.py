@@ -9,7 +9,7 @@ from sim2real.artifacts.recording import Recording
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode
 from sim2real.stages.load import load_robot
-from sim2real.stages.pipeline.open_log import open_recording, require_units
+from sim2real.stages.shared.arguments import open_recording, require_units
 
 DATASET = Path(__file__).parents[2] / "datasets" / "pendulum" / "steps.mcap"
 

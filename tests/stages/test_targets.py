@@ -7,7 +7,7 @@ import pytest
 from sim2real.artifacts import run as run_folder
 from sim2real.errors import SafetyStop, UsageError
 from sim2real.stages.config import RecordConfig
-from sim2real.stages.pipeline import find_run
+from sim2real.stages.shared import find_run
 
 
 def record(root, run_dir=None, pipeline="pendulum", text="log"):

@@ -18,7 +18,7 @@ from sim2real.artifacts.identification import (
 from sim2real.artifacts.recording import Recording
 from sim2real.errors import UsageError
 from sim2real.stages.load import load_robot
-from sim2real.stages.pipeline.open_log import open_recording
+from sim2real.stages.shared.arguments import open_recording
 from sim2real.stages.shared.identification import identified_robot
 from sim2real.stages.validate import stage
 from sim2real.stages.validate.config import ValidateConfig

@@ -24,10 +24,10 @@ from sim2real.identification.segments import Span
 from sim2real.stages.config import IdentifyConfig
 from sim2real.stages.identify import fitting
 from sim2real.stages.load import load_robot
-from sim2real.stages.pipeline import from_model
-from sim2real.stages.pipeline.open_log import open_recording
-from sim2real.stages.pipeline.robot_flags import RobotFlags
+from sim2real.stages.shared import from_model
 from sim2real.stages.shared import identification as shared
+from sim2real.stages.shared.arguments import open_recording
+from sim2real.stages.shared.robot_flags import RobotFlags
 
 SETTLE_S = 0.3
 """Length of the samples from which the initial state of the disk's free run is estimated [s]."""

@@ -28,9 +28,9 @@ from sim2real.graph.episode import Episode
 from sim2real.log.importing.importer import import_file
 from sim2real.log.importing.mapping import load_mapping
 from sim2real.stages.load import folder_of
-from sim2real.stages.pipeline import from_model
-from sim2real.stages.pipeline.open_log import open_recording
-from sim2real.stages.pipeline.robot_flags import RobotFlags
+from sim2real.stages.shared import from_model
+from sim2real.stages.shared.arguments import open_recording
+from sim2real.stages.shared.robot_flags import RobotFlags
 
 DISK_BLOCK, DISK_BLOCKS, PAST = 5000, 5, 12
 GO2_BLOCKS = 3

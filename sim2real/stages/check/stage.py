@@ -30,8 +30,7 @@ from sim2real.stages.check.config import CheckConfig
 from sim2real.stages.excitation.played import played
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.load import AnyRobot, defaults_of, robot_of
-from sim2real.stages.pipeline.open_log import open_recording
-from sim2real.stages.pipeline.python_arguments import AnyRecording, config_of, recordings_of
+from sim2real.stages.shared.arguments import AnyRecording, config_of, open_recording, recordings_of
 from sim2real.stages.shared.identification import command, side_by_side, usable
 from sim2real.stages.terminal.console import artifact_table, note, pairs, progress, shown
 from sim2real.types import Json

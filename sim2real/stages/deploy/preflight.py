@@ -12,7 +12,7 @@ from sim2real.policy.contract import ActionTerm, ObservationTerm
 from sim2real.robots.robot import RecordedRobot, Robot
 from sim2real.stages.deploy.config import DeployConfig
 from sim2real.stages.load import shipped_policy
-from sim2real.stages.pipeline.find_run import warn_of_stale
+from sim2real.stages.shared.find_run import warn_of_stale
 from sim2real.stages.terminal.console import note
 
 _TRAIN, EMBEDDED = "train a policy for this pipeline", "embedded"

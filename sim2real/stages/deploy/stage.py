@@ -20,16 +20,16 @@ from sim2real.stages.deploy.episodes import check_timing, run_episodes
 from sim2real.stages.deploy.preflight import find_bundle, require_fit
 from sim2real.stages.deploy.show import show, show_sessions, summary_lines
 from sim2real.stages.load import AnyRobot, defaults_of, moving, robot_of
-from sim2real.stages.pipeline import python_arguments
-from sim2real.stages.pipeline.open_parameters import check_parameters, open_identification
+from sim2real.stages.shared import arguments
+from sim2real.stages.shared.arguments import check_parameters, open_identification
 
 
 def deploy(
     robot: AnyRobot,
-    bundle: python_arguments.AnyBundle,
-    folder: python_arguments.AnyPath,
+    bundle: arguments.AnyBundle,
+    folder: arguments.AnyPath,
     config: DeployConfig | Mapping[str, object] | None = None,
-    identification: python_arguments.AnyIdentification | None = None,
+    identification: arguments.AnyIdentification | None = None,
 ) -> Deployment:
     """Run a policy on the robot, and compare with the simulation.
 
@@ -49,10 +49,10 @@ def deploy(
     """
     # Check all arguments before the robot moves.
     robot = robot_of(robot)
-    bundle, folder = python_arguments.bundle_of(bundle), python_arguments.folder_of(folder)
-    config = python_arguments.config_of(config, defaults_of(robot).deploy)
+    bundle, folder = arguments.bundle_of(bundle), arguments.folder_of(folder)
+    config = arguments.config_of(config, defaults_of(robot).deploy)
     if identification is not None:
-        identification = python_arguments.identification_of(identification)
+        identification = arguments.identification_of(identification)
     robot = _commanded(moving(robot), config)
     require_fit(robot, bundle, config)
     if identification is not None:

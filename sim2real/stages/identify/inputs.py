@@ -21,7 +21,7 @@ from sim2real.identification.parameters import ParameterTable
 from sim2real.identification.segments import Span
 from sim2real.robots.robot import RecordedRobot, Robot, in_world
 from sim2real.stages.identify.config import IdentifyConfig
-from sim2real.stages.pipeline.open_log import require_units
+from sim2real.stages.shared.arguments import require_units
 from sim2real.stages.shared.identification import (
     hash_of,
     offering,

@@ -22,8 +22,7 @@ from sim2real.stages.identify.judgement import judge
 from sim2real.stages.identify.progress import PARTIAL, Best, kept
 from sim2real.stages.identify.show import show, summary
 from sim2real.stages.load import AnyRobot, defaults_of, robot_of
-from sim2real.stages.pipeline.open_log import open_recording
-from sim2real.stages.pipeline.python_arguments import AnyRecording, config_of, recordings_of
+from sim2real.stages.shared.arguments import AnyRecording, config_of, open_recording, recordings_of
 from sim2real.stages.shared.identification import command, continuing
 from sim2real.stages.terminal.console import progress, shown
 

@@ -19,9 +19,9 @@ from sim2real.stages.live.viewer import live_view
 from sim2real.stages.load import AnyRobot, defaults_of, moving, robot_of
 from sim2real.stages.on_robot.episode import check_deadlines, run_episode
 from sim2real.stages.on_robot.open_robot import opened
-from sim2real.stages.pipeline.python_arguments import AnyPath, config_of, folder_of
 from sim2real.stages.record.config import RecordConfig
 from sim2real.stages.record.show import show, show_by_hand, show_open
+from sim2real.stages.shared.arguments import AnyPath, config_of, folder_of
 from sim2real.stages.terminal.console import note
 from sim2real.types import Json
 

@@ -12,8 +12,8 @@ from sim2real.artifacts.timing import Timing
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.robots.robot import RecordedRobot
 from sim2real.stages.load import moving
-from sim2real.stages.pipeline.find_run import warn_of_stale
-from sim2real.stages.pipeline.open_parameters import check_parameters, open_identification
+from sim2real.stages.shared.arguments import check_parameters, open_identification
+from sim2real.stages.shared.find_run import warn_of_stale
 from sim2real.stages.terminal.console import note
 from sim2real.stages.train.config import TrainConfig
 from sim2real.stages.train.resume import CHECKPOINT, check_same_parameters, find_interrupted

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from sim2real.artifacts.run import RUNNING, StageFolder, attempts, run_folders, sha256
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.stages.pipeline.find_run import find_run
+from sim2real.stages.shared.find_run import find_run
 from sim2real.stages.terminal.console import note, shown
 from sim2real.stages.train.config import TrainConfig
 

@@ -14,15 +14,15 @@ from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.run import StageFolder, open_stage
 from sim2real.robots.robot import RecordedRobot
 from sim2real.stages.load import AnyRobot, defaults_of, moving, robot_of
-from sim2real.stages.pipeline import python_arguments
-from sim2real.stages.pipeline.python_arguments import (
+from sim2real.stages.shared import arguments
+from sim2real.stages.shared.arguments import (
     AnyIdentification,
     AnyPath,
     AnyRecording,
     AnyTiming,
     config_of,
     identification_of,
-    recording_of,
+    recordings_of,
 )
 from sim2real.stages.terminal.console import note, progress
 from sim2real.stages.terminal.interruption import patiently
@@ -75,8 +75,8 @@ def train(
     robot = moving(robot_of(robot))
     config = config_of(config, defaults_of(robot).train)
     identification = None if identification is None else identification_of(identification)
-    timing = None if timing is None else python_arguments.timing_of(timing)
-    recording = None if log is None else recording_of(log, robot, "log")
+    timing = None if timing is None else arguments.timing_of(timing)
+    recording = None if log is None else recordings_of(log, robot, "log")[0]
 
     # Draw the episodes.
     with progress(None, "train: draw episodes", leads()):

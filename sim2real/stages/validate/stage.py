@@ -34,9 +34,8 @@ from sim2real.identification.verdict import ACCEPTED, scores
 from sim2real.robots.robot import RecordedRobot, Robot
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.load import AnyRobot, defaults_of, load_robot, robot_of
-from sim2real.stages.pipeline import python_arguments
-from sim2real.stages.pipeline.open_log import open_recording
-from sim2real.stages.pipeline.python_arguments import AnyIdentification, AnyRecording
+from sim2real.stages.shared import arguments
+from sim2real.stages.shared.arguments import AnyIdentification, AnyRecording, open_recording
 from sim2real.stages.shared.identification import command, identified_robot, require_new, side_by_side, usable
 from sim2real.stages.terminal.console import artifact_table, note, progress, shown
 from sim2real.stages.validate.config import ValidateConfig
@@ -193,11 +192,11 @@ def validate(
         config: A dict holds the fields that differ from the default.
     """
     robot = robot_of(robot)
-    document = python_arguments.identification_of(identification)
+    document = arguments.identification_of(identification)
     if document.pipeline != robot.name:
         raise UsageError(f"these are parameters of pipeline {document.pipeline!r}, not of {robot.name!r}")
-    logs = python_arguments.recordings_of(recording, robot)
-    return score(document, robot, logs, python_arguments.config_of(config, ValidateConfig()))
+    logs = arguments.recordings_of(recording, robot)
+    return score(document, robot, logs, arguments.config_of(config, ValidateConfig()))
 
 
 def score(

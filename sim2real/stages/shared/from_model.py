@@ -22,7 +22,7 @@ from sim2real.robots.model.parameters import ParameterPattern, usual_patterns
 from sim2real.robots.model.robot import COMMANDS, ROBOT_FILE, MjcfRobot, RobotConfig
 from sim2real.stages.config import MODEL_IDENTIFY, Defaults
 from sim2real.stages.import_logs import stage as import_logs_stage
-from sim2real.stages.pipeline.robot_flags import RobotFlags
+from sim2real.stages.shared.robot_flags import RobotFlags
 from sim2real.stages.terminal import console
 from sim2real.stages.terminal.console import note
 from sim2real.types import MjModel

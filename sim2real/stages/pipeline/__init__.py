@@ -1,1 +1,0 @@
-"""Logs, parameters and runs of a robot, as stages open them."""
