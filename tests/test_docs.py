@@ -87,7 +87,7 @@ TRUE = {
     ],
     "docs/guides/compose.md": ["task.arm.joints[0].full_identifier == 'arm/shoulder'"],
     "docs/guides/import.md": ["len(episode.outputs['sensor']['th']) == len(episode.steps['sensor'].start) == 20_000"],
-    "docs/guides/interop.md": ["robot.length == 249"],
+    "docs/guides/interop.md": ["robot.step_limit == 249"],
     "docs/guides/robot_computer.md": [
         "abs(features(Measurement(3.141592653589793)) - [-1.0, 0.0]).max() < 1e-6",
         "abs(reward(Measurement(3.141592653589793)) + 1.0) < 1e-6",

@@ -35,15 +35,17 @@ from sim2real.composer.variation.base import Variation as Variation
 if TYPE_CHECKING:
     from sim2real.composer.physics.mjx.environment import MjxEnvironment as MjxEnvironment
     from sim2real.interop.brax import BraxEnv as BraxEnv
-    from sim2real.interop.vector import MjxVectorEnv as MjxVectorEnv
+    from sim2real.interop.vector import CopiesVectorEnv
     from sim2real.worlds.composed import ComposedWorld as ComposedWorld
+
+    MjxVectorEnv = CopiesVectorEnv
 
 Model = RootElement
 _LAZY = {
-    "BraxEnv": "sim2real.interop.brax",
-    "ComposedWorld": "sim2real.worlds.composed",
-    "MjxEnvironment": "sim2real.composer.physics.mjx.environment",
-    "MjxVectorEnv": "sim2real.interop.vector",
+    "BraxEnv": ("sim2real.interop.brax", "BraxEnv"),
+    "ComposedWorld": ("sim2real.worlds.composed", "ComposedWorld"),
+    "MjxEnvironment": ("sim2real.composer.physics.mjx.environment", "MjxEnvironment"),
+    "MjxVectorEnv": ("sim2real.interop.vector", "CopiesVectorEnv"),
 }
 
 
@@ -51,5 +53,6 @@ def __getattr__(name: str) -> object:
     """Import what needs JAX, brax or gymnasium when it is first used."""
     if name not in _LAZY:
         raise AttributeError(f"module 'sim2real.composer' has no attribute {name!r}")
-    value = globals()[name] = getattr(importlib.import_module(_LAZY[name]), name)
+    module, attribute = _LAZY[name]
+    value = globals()[name] = getattr(importlib.import_module(module), attribute)
     return value

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict, Unpack
 if TYPE_CHECKING:
     from gymnasium.vector import AutoresetMode
 
-    from sim2real.interop.brax import RobotBraxEnv
-    from sim2real.interop.environments import RobotEnvironment
-    from sim2real.interop.vector import RobotVectorEnv
+    from sim2real.interop.brax import BraxEnv
+    from sim2real.interop.robot import RobotEnvironment
+    from sim2real.interop.vector import CopiesVectorEnv
     from sim2real.robots.robot import Robot
     from sim2real.stages.train.config import TrainConfig
 
@@ -55,7 +55,7 @@ def robot_environment(
         Sim2RealError: When there is no identification, or not of this robot.
     """
     from sim2real.artifacts.run import STAGES, attempts
-    from sim2real.interop.environments import RobotEnvironment
+    from sim2real.interop.robot import RobotEnvironment
     from sim2real.robots.robot import Robot
     from sim2real.stages.load import available, defaults_of, load_robot, moving
     from sim2real.stages.shared.arguments import open_identification
@@ -85,16 +85,16 @@ def vector_env(
     num_envs: int,
     autoreset_mode: AutoresetMode | str = "NextStep",
     **options: Unpack[Options],
-) -> RobotVectorEnv:
+) -> CopiesVectorEnv:
     """Return copies of a robot as a ``gymnasium.vector.VectorEnv``.
 
     Args:
         source: See ``robot_environment``; or its result.
         autoreset_mode: When a copy that is done is reset: ``NextStep``, ``SameStep`` or ``Disabled``.
     """
-    from sim2real.interop.vector import RobotVectorEnv
+    from sim2real.interop.vector import CopiesVectorEnv
 
-    return RobotVectorEnv(_environment(source, options), num_envs, autoreset_mode)
+    return CopiesVectorEnv(_environment(source, options), num_envs, autoreset_mode)
 
 
 def baselines_env(
@@ -111,18 +111,18 @@ def baselines_env(
     return to_baselines(vector_env(source, num_envs, "SameStep", **options), seed)
 
 
-def brax_env(source: Source | RobotEnvironment, **options: Unpack[Options]) -> RobotBraxEnv:
+def brax_env(source: Source | RobotEnvironment, **options: Unpack[Options]) -> BraxEnv:
     """Return a robot as a ``brax.envs.Env``.
 
     Args:
         source: See ``robot_environment``; or its result.
     """
-    from sim2real.interop.brax import RobotBraxEnv
+    from sim2real.interop.brax import BraxEnv
 
-    return RobotBraxEnv(_environment(source, options))
+    return BraxEnv(_environment(source, options))
 
 
 def _environment(source: Source | RobotEnvironment, options: Options) -> RobotEnvironment:
-    from sim2real.interop.environments import RobotEnvironment
+    from sim2real.interop.robot import RobotEnvironment
 
     return source if isinstance(source, RobotEnvironment) else robot_environment(source, **options)

@@ -1,19 +1,18 @@
-"""Pure environments with the interface of ``brax.envs``: composed tasks, and robots with their delays."""
+"""A composed task, or a robot with its delays, with the interface of ``brax.envs``."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sim2real.composer.physics.mjx.environment import MjxEnvironment
+from sim2real.composer.physics.mjx.environment import MjxEnvironment, State
 from sim2real.errors import Sim2RealError
 from sim2real.installation import with_extra
-from sim2real.interop.environments import PureEnvironment, PureTask, RobotEnvironment, Transition
+from sim2real.interop.robot import Copy, RobotEnvironment, specs_of
 
 try:
     from brax.envs.base import Env
@@ -32,8 +31,13 @@ _STEPS = "steps"
 """Entry in which brax's ``EpisodeWrapper`` counts the steps of an episode."""
 
 
-class PureBraxEnv(Env):
-    """A pure environment whose observation is a vector.
+class BraxEnv(Env):
+    """A composed task on MJX, or a robot with its delays.
+
+    The observation of a task is a vector: its observables, one after the other, in their order. Actions of a task
+    follow its ``action_spec``; those of a robot go from -1, the lower bound of ``environment.action``, to 1, the upper
+    one, as brax has no bounds of actions. ``info["failed"]`` is 1 where a task drew no acceptable initial
+    state.
 
     ``info["truncation"]`` is 1 where only the time limit ended an episode. brax's ``EpisodeWrapper`` overwrites that
     entry, and takes ``done`` for a termination. So under that wrapper a time limit does not set ``done``; the wrapper's
@@ -44,21 +48,27 @@ class PureBraxEnv(Env):
     all episodes would be the same. This environment replaces that state at every step by a fresh start, drawn from
     ``info["key"]``. That costs a reset a step.
 
-    ``metrics`` has the values of a whole episode in its last step, and 0 in all others.
+    ``metrics`` has the values of a robot's whole episode, ``return`` and ``success``, in its last step, and 0 in all
+    others.
     """
 
-    def __init__(self, pure: PureEnvironment) -> None:
-        if isinstance(pure.observation_spec, Mapping):
-            raise TypeError("brax takes observations that are one vector, this environment has a dictionary")
-        self._pure = pure
-        self._sizes = math.prod(pure.observation_spec.shape), math.prod(pure.action_spec.shape)
-        self.max_episode_length = pure.length
+    def __init__(self, environment: MjxEnvironment | RobotEnvironment) -> None:
+        self.environment: PyTree = environment
+        observation, action = specs_of(environment)
+        shapes = observation.values() if isinstance(observation, dict) else [observation]
+        self._sizes = sum(math.prod(spec.shape) for spec in shapes), math.prod(action.shape)
+        self.max_episode_length = environment.step_limit
+        self._middle: PyTree = 0.0
+        self._half: PyTree = 1.0
+        if isinstance(environment, RobotEnvironment):
+            low, high = np.array([(e.low, e.high) for e in environment.action], np.float32).T
+            self._middle, self._half = (high + low) / 2, (high - low) / 2
 
     def reset(self, rng: Key) -> BraxState:
         """Return a copy at the start of an episode."""
         rng, key = jax.random.split(rng)
-        transition = self._pure.reset(rng)
-        return self._brax_state(transition, transition.reward, {"key": key}, {})
+        copy = self.environment.reset(rng)
+        return self._brax_state(copy, copy.reward, {"key": key}, {})
 
     def step(self, state: BraxState, action: jax.Array) -> BraxState:
         """Return the copy one step later."""
@@ -66,28 +76,27 @@ class PureBraxEnv(Env):
         info = {**state.info}
         info["key"], key = jax.random.split(info["key"])
         if _FIRST_STATE in info:
-            fresh = self._pure.reset(key)
-            info |= {_FIRST_STATE: fresh.state, _FIRST_OBSERVATION: fresh.observation}
-        transition = self._pure.step(before, action)
+            fresh = self.environment.reset(key)
+            info |= {_FIRST_STATE: fresh, _FIRST_OBSERVATION: _vector(fresh)}
+        if isinstance(self.environment, RobotEnvironment):
+            action = self._middle + self._half * jnp.clip(action, -1.0, 1.0)
+        copy = self.environment.step(before, action)
         # An episode that goes on past its time limit must not train a policy without notice.
-        reward = jnp.where(before.truncated, jnp.nan, transition.reward)
-        return self._brax_state(transition, reward, info, state.metrics)
+        reward = jnp.where(before.truncated, jnp.nan, copy.reward)
+        return self._brax_state(copy, reward, info, state.metrics)
 
     def _brax_state(
-        self,
-        transition: Transition,
-        reward: jax.Array,
-        info: dict[str, jax.Array],
-        metrics: dict[str, jax.Array],
+        self, copy: State | Copy, reward: jax.Array, info: dict[str, jax.Array], metrics: dict[str, jax.Array]
     ) -> BraxState:
         dtype = reward.dtype
-        ended = transition.terminated | transition.truncated
-        done = transition.terminated if _STEPS in info else ended
-        info |= {"truncation": transition.truncated.astype(dtype)}
-        info |= {name: value.astype(dtype) for name, value in transition.info.items()}
-        # brax's wrappers add metrics of their own, which stay.
-        metrics = metrics | {n: jnp.where(ended, v, 0.0) for n, v in transition.episode_values.items()}
-        return BraxState(transition.state, transition.observation, reward, done.astype(dtype), metrics, info)
+        done = copy.done & ~copy.truncated if _STEPS in info else copy.done
+        info |= {"truncation": copy.truncated.astype(dtype)}
+        if isinstance(copy, State):
+            info |= {"discount": copy.discount.astype(dtype), "failed": copy.failed.astype(dtype)}
+        else:  # brax's wrappers add metrics of their own, which stay
+            metrics = metrics | {n: jnp.where(copy.done, v, 0.0) for n, v in copy.values.items()}
+        state: PyTree = copy
+        return BraxState(state, _vector(copy), reward, done.astype(dtype), metrics, info)
 
     @property
     def observation_size(self) -> int:
@@ -107,41 +116,15 @@ class PureBraxEnv(Env):
     @property
     def dt(self) -> float:
         """Time between two actions [s]."""
-        return self._pure.period_s
+        environment = self.environment
+        if isinstance(environment, RobotEnvironment):
+            return 1.0 / environment.rate_hz
+        return environment.task.control_timestep
 
 
-class BraxEnv(PureBraxEnv):
-    """Runs a task on MJX with the interface of ``brax.envs``; see ``PureBraxEnv`` for episodes and their ends.
-
-    The observation is a vector: the task's observables, one after the other, in their order. Actions follow the task's
-    ``action_spec``. ``info["failed"]`` is 1 where no acceptable initial state was drawn.
-    """
-
-    def __init__(self, environment: MjxEnvironment) -> None:
-        self.environment = environment
-        super().__init__(PureTask(environment, flat=True))
-
-
-class RobotBraxEnv(PureBraxEnv):
-    """One robot with its delays, with the interface of ``brax.envs``; see ``PureBraxEnv`` for episodes and their ends.
-
-    brax has no bounds of actions; its learners send values between -1 and 1. Here an action of -1 stands for the lower
-    bound of ``robot.action`` and 1 for the upper one. ``metrics`` has an episode's ``return`` and ``success``.
-
-    Attributes:
-        robot: One copy; ``robot.observation`` and ``robot.action`` name each entry, with unit and bounds.
-    """
-
-    def __init__(self, robot: RobotEnvironment) -> None:
-        self.robot = robot
-        low, high = np.array([(e.low, e.high) for e in robot.action], np.float32).T
-        self._middle, self._half = (high + low) / 2, (high - low) / 2
-        super().__init__(robot)
-
-    def step(self, state: BraxState, action: jax.Array) -> BraxState:
-        """Return the copy after the policy's next step.
-
-        Args:
-            action: Shape ``(A,)``, from -1 to 1.
-        """
-        return super().step(state, self._middle + self._half * jnp.clip(action, -1.0, 1.0))
+def _vector(copy: State | Copy) -> jax.Array:
+    """Return an observation as one vector."""
+    observation = copy.observation
+    if not isinstance(observation, dict):
+        return observation
+    return jnp.concatenate([jnp.ravel(value) for value in observation.values()])

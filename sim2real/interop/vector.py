@@ -1,22 +1,22 @@
-"""Copies of a pure environment with the interface of ``gymnasium.vector``: composed tasks, and robots.
+"""Copies of a composed task or of a robot, with the interface of ``gymnasium.vector``.
 
 Two compiled programs step all copies together.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import numpy as np
 from dm_env import specs
 
-from sim2real.composer.physics.mjx.environment import MjxEnvironment
+from sim2real.composer.physics.mjx.environment import MjxEnvironment, State
 from sim2real.composer.task import UNLIMITED
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.installation import with_extra
-from sim2real.interop.environments import PureEnvironment, PureTask, RobotEnvironment, Transition
+from sim2real.interop.robot import Copy, RobotEnvironment, specs_of
 from sim2real.training.environment.protocol import select
 
 try:
@@ -36,22 +36,48 @@ Infos = dict[str, "PyTree"]
 """Name -> values of the copies, and ``_NAME`` -> mask of the copies that have one."""
 
 
+class Shown(NamedTuple):
+    """What a step shows of a copy."""
+
+    observation: PyTree
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    infos: dict[str, jax.Array]
+    values: dict[str, jax.Array]
+
+
+def shown(state: State | Copy) -> Shown:
+    """Return what a step shows of a copy: of a task its discount too, of a robot values of the whole episode."""
+    of_task = isinstance(state, State)
+    infos = {"discount": state.discount, "failed": state.failed} if of_task else {}
+    terminated, values = state.done & ~state.truncated, {} if of_task else state.values
+    return Shown(state.observation, state.reward, terminated, state.truncated, infos, values)
+
+
 class CopiesVectorEnv(VectorEnv):
-    """Copies of a pure environment.
+    """Copies of a composed task, whose observations are dictionaries of observables, or of a robot with its delays.
 
     With ``AutoresetMode.NEXT_STEP`` a copy that is done is reset at the next step, whose action is ignored and whose
     reward is 0. With ``SAME_STEP`` it is reset at once; ``infos`` then has ``final_obs`` and ``final_info``. With
     ``DISABLED`` the caller resets it: ``reset(options={"reset_mask": mask})``.
 
     Copy i of ``reset(seed=s)`` has the seed s + i, as in gymnasium's own vector environments. The episodes of a copy
-    depend on its seed and its actions alone.
+    depend on its seed and its actions alone. At the end of an episode of a robot infos have its ``return`` and
+    ``success``: the share of its second half in which the task was fulfilled.
+
+    Attributes:
+        environment: One copy; of a robot, ``environment.observation`` and ``.action`` name each entry.
 
     Raises:
         UsageError: When ``num_envs`` is below 1, or there is no such mode.
     """
 
     def __init__(
-        self, pure: PureEnvironment, num_envs: int, autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP
+        self,
+        environment: MjxEnvironment | RobotEnvironment,
+        num_envs: int,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
     ) -> None:
         if num_envs < 1:
             raise UsageError(f"num_envs must be at least 1, got {num_envs}")
@@ -62,30 +88,31 @@ class CopiesVectorEnv(VectorEnv):
         self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": []}
         self.num_envs = num_envs
         # Spaces of one copy, and of all copies.
-        observation = pure.observation_spec
-        if isinstance(observation, Mapping):
+        observation, action = specs_of(environment)
+        if isinstance(observation, dict):
             self.single_observation_space = gymnasium.spaces.Dict({k: _box(v) for k, v in observation.items()})
         else:
             self.single_observation_space = _box(observation)
-        self.single_action_space = _action_box(pure.action_spec)
+        self.single_action_space = _action_box(action)
         batch = gymnasium.vector.utils.batch_space
         self.observation_space = batch(self.single_observation_space, num_envs)
         self.action_space = batch(self.single_action_space, num_envs)
         # Compiled functions over all copies.
-        self._pure = pure
-        self._step = jax.jit(jax.vmap(pure.step))
+        self.environment = environment
+        step: PyTree = environment.step
+        self._step = jax.jit(jax.vmap(lambda state, action: step(state, action)))
         self._start, self._restart = jax.jit(self._reset_all), jax.jit(self._reset_some)
         self._keys_of = jax.jit(jax.vmap(jax.random.key))
         self._keys: jax.Array | None = None
-        self._last: Transition | None = None
+        self._last: PyTree = None
         self._done = np.zeros(num_envs, bool)
 
-    def _reset_all(self, keys: jax.Array) -> tuple[Transition, jax.Array]:
+    def _reset_all(self, keys: jax.Array) -> tuple[PyTree, jax.Array]:
         """Return all copies at the start of an episode, and their keys for the next one."""
         next_keys, keys = jax.vmap(jax.random.split, out_axes=1)(keys)
-        return jax.vmap(self._pure.reset)(keys), next_keys
+        return jax.vmap(lambda key: self.environment.reset(key))(keys), next_keys
 
-    def _reset_some(self, last: Transition, keys: jax.Array, mask: jax.Array) -> tuple[Transition, jax.Array]:
+    def _reset_some(self, last: PyTree, keys: jax.Array, mask: jax.Array) -> tuple[PyTree, jax.Array]:
         """Return the copies, those of the mask at the start of an episode, and the keys for the next ones."""
         fresh, next_keys = self._reset_all(keys)
         return select(mask, fresh, last), select(mask, next_keys, keys)
@@ -113,8 +140,8 @@ class CopiesVectorEnv(VectorEnv):
             last, self._keys = self._restart(self._last, self._keys, jax.numpy.asarray(mask))
             self._done = self._done & ~mask
         self._last = last
-        observation, info = jax.device_get((last.observation, last.info))
-        return _writable(observation), _masked(info, np.ones(self.num_envs, bool))
+        first = jax.device_get(shown(last))
+        return _writable(first.observation), _masked(first.infos, np.ones(self.num_envs, bool))
 
     def step(self, actions: ArrayLike) -> tuple[PyTree, np.ndarray, np.ndarray, np.ndarray, Infos]:
         """Step all copies; return observations, rewards, terminations, truncations and infos.
@@ -131,26 +158,26 @@ class CopiesVectorEnv(VectorEnv):
                 f"copies {np.flatnonzero(done_before).tolist()} are done",
                 hint="reset them: reset(options={'reset_mask': terminations | truncations})",
             )
-        last = self._step(self._last.state, self._checked(actions))
+        last = self._step(self._last, self._checked(actions))
         # Reset the copies that were done before this step.
         if mode is AutoresetMode.NEXT_STEP and done_before.any():
             last, self._keys = self._restart(last, self._keys, done_before)
         # Copy the results to the host at once; the state stays on the device.
-        results = jax.device_get(last._replace(state=None))
+        results = jax.device_get(shown(last))
         done = results.terminated | results.truncated
-        episode_values = _masked(results.episode_values, done) if done.any() else {}
+        episode_values = _masked(results.values, done) if done.any() else {}
         all_copies = np.ones(self.num_envs, bool)
-        observation, infos = results.observation, _masked(results.info, all_copies) | episode_values
+        observation, infos = results.observation, _masked(results.infos, all_copies) | episode_values
         self._done = done
         # Reset the copies that are done now, and keep their last observation.
         if mode is AutoresetMode.SAME_STEP and done.any():
             final = np.full(self.num_envs, None, object)
             for i in np.flatnonzero(done):
                 final[i] = jax.tree.map(lambda leaf, i=i: np.array(leaf[i]), observation)
-            final_info = _masked(results.info, done) | episode_values
+            final_info = _masked(results.infos, done) | episode_values
             last, self._keys = self._restart(last, self._keys, done)
-            observation, info = jax.device_get((last.observation, last.info))
-            infos = _masked(info, all_copies)
+            first = jax.device_get(shown(last))
+            observation, infos = first.observation, _masked(first.infos, all_copies)
             infos |= {"final_obs": final, "_final_obs": done, "final_info": final_info, "_final_info": done}
             self._done = np.zeros(self.num_envs, bool)
         self._last = last
@@ -193,33 +220,6 @@ class CopiesVectorEnv(VectorEnv):
                 f"got {mask.dtype} of shape {mask.shape}"
             )
         return mask
-
-
-class MjxVectorEnv(CopiesVectorEnv):
-    """Copies of a task; observations are dictionaries of observables. See ``CopiesVectorEnv`` for seeds and resets."""
-
-    def __init__(
-        self, environment: MjxEnvironment, num_envs: int, autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP
-    ) -> None:
-        self.environment = environment
-        super().__init__(PureTask(environment, flat=False), num_envs, autoreset_mode)
-
-
-class RobotVectorEnv(CopiesVectorEnv):
-    """Copies of a robot with its delays; see ``CopiesVectorEnv`` for seeds, resets and ends of episodes.
-
-    At the end of an episode infos have its ``return`` and ``success``: the share of its second half in which the task
-    was fulfilled.
-
-    Attributes:
-        robot: One copy; ``robot.observation`` and ``robot.action`` name each entry, with unit and bounds.
-    """
-
-    def __init__(
-        self, robot: RobotEnvironment, num_envs: int, autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP
-    ) -> None:
-        self.robot = robot
-        super().__init__(robot, num_envs, autoreset_mode)
 
 
 def _box(spec: specs.Array) -> gymnasium.spaces.Box:

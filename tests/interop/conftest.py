@@ -13,5 +13,5 @@ STEPS = 11
 def pendulum():
     config = TrainConfig(episode_s=0.5, timelines=2)
     made = robot_environment("pendulum", "nominal", DELAYS, config)
-    assert made.length == made.env.length == 24
+    assert made.step_limit == made.env.length == 24
     return made

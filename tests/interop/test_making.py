@@ -39,7 +39,7 @@ def test_what_does_not_exist_is_named(tmp_path):
 def test_a_robot_that_shows_more_than_it_names_is_refused(pendulum):
     from dataclasses import replace
 
-    from sim2real.interop.environments import RobotEnvironment
+    from sim2real.interop.robot import RobotEnvironment
     from sim2real.stages.train.trained_bundle import contract_of
 
     env = pendulum.env

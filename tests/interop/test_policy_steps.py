@@ -9,7 +9,7 @@ import pytest
 
 from sim2real.errors import UsageError
 from sim2real.graph.schedule import draw
-from sim2real.interop.environments import RobotEnvironment
+from sim2real.interop.robot import RobotEnvironment
 from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.stages.load import load_robot
 from sim2real.stages.train.trained_bundle import contract_of
@@ -41,20 +41,20 @@ def played():
 
     def by_steps(state, action):
         made = robot.step(state, action)
-        return made.state, made._replace(state=made.state.env.step_state.seq)
+        return made, made._replace(env=made.env.step_state.seq, key=())
 
     of_row = actions[np.maximum(np.cumsum(turns) - 1, 0)][: env.length]
     rows = jax.jit(lambda: jax.lax.scan(by_rows, env.reset(jax.random.split(key)[0])[0], of_row)[1])()
     first = robot.reset(key)
-    steps = jax.jit(lambda state: jax.lax.scan(by_steps, state, actions[: robot.length])[1])(first.state)
+    steps = jax.jit(lambda state: jax.lax.scan(by_steps, state, actions[: robot.step_limit])[1])(first)
     as_numpy = lambda tree: jax.tree.map(np.asarray, tree)  # noqa: E731
-    return SimpleNamespace(turns=turns, rows=as_numpy(rows), steps=as_numpy(steps), state=first.state)
+    return SimpleNamespace(turns=turns, rows=as_numpy(rows), steps=as_numpy(steps), state=first)
 
 
 def test_every_step_is_one_of_the_policy(played):
     assert int(played.state.env.step_state.seq) == 0
     assert np.flatnonzero(played.steps.truncated).tolist() == [played.turns.sum() - 2]
-    assert played.steps.state.tolist() == list(range(1, played.turns.sum()))
+    assert played.steps.env.tolist() == list(range(1, played.turns.sum()))
 
 
 def test_rewards_of_the_rows_between_are_added_to_the_step_before(played):
