@@ -92,29 +92,15 @@ class Judgement:
 
 
 @dataclass(frozen=True)
-class Matrix:
-    """A matrix ``(P, P)`` over named parameters."""
-
-    names: tuple[str, ...]
-    matrix: np.ndarray
-
-    def __post_init__(self) -> None:
-        size = len(self.names)
-        check(self.matrix.shape == (size, size), f"a matrix of {self.matrix.shape} for {size} names")
-
-
-@dataclass(frozen=True)
 class Determined:
     """Determinacy of the parameters at the estimate.
 
     Attributes:
-        condition: Condition number of the Jacobian; its columns are scaled by the widths of the bounds.
         undetermined: Groups of parameters; the data determines at most combinations of each group.
         messages: The same in sentences.
         standard_error_per_minute: Parameter -> expected standard error after one minute of such data.
     """
 
-    condition: float | None
     undetermined: tuple[tuple[str, ...], ...]
     messages: tuple[str, ...]
     standard_error_per_minute: Mapping[str, float | None]
@@ -122,13 +108,12 @@ class Determined:
 
 @dataclass(frozen=True)
 class Prediction:
-    """Errors of a model up to a horizon: field -> root mean square and mean absolute error; None without data."""
+    """Errors of a model up to a horizon: field -> root mean square error; None without data."""
 
     model: str
     horizon_s: float
     held_out: bool
     rmse: Mapping[str, float | None]
-    mae: Mapping[str, float | None]
 
 
 @dataclass(frozen=True)
@@ -163,7 +148,6 @@ class FreeRun:
     held_out: bool
     field: str
     rmse: float | None
-    mae: float | None
 
 
 @dataclass(frozen=True)
@@ -221,15 +205,6 @@ class Noise:
 
 
 @dataclass(frozen=True)
-class Refinement:
-    """A local refinement: the loss before and after, and the number of steps."""
-
-    before: float | None
-    after: float | None
-    steps: int
-
-
-@dataclass(frozen=True)
 class Search:
     """The search for the estimate.
 
@@ -244,7 +219,6 @@ class Search:
     strategy: str | None = None
     history: np.ndarray = field(default_factory=lambda: np.zeros(0))
     evaluations: int = 0
-    refined: tuple[Refinement, ...] = ()
     seconds: float | None = None
     loss: float | None = None
     done: Mapping[str, float] = field(default_factory=dict)
@@ -591,8 +565,6 @@ class Identification(Shown):
     verdict: Judgement
     parameters: tuple[Estimate, ...]
     search: Search = field(default_factory=Search)
-    covariance: Matrix | None = None
-    correlation: Matrix | None = None
     misfit: float | None = None
     check: Determined | None = None
     prediction: tuple[Prediction, ...] = ()

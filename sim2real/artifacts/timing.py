@@ -1,7 +1,7 @@
 """The timing of one session, from which training draws its delays without the log.
 
 ``timing.npz`` has every node's computation times and bus transfers, and every connection's transport times, in order.
-``timing.json`` has their quantiles for people, and the session's counts: lost answers, overruns, the clock.
+``timing.json`` has quantiles of the nodes for people. The log's end has the session's counts, such as lost answers.
 """
 
 from __future__ import annotations
@@ -63,7 +63,6 @@ class NodeTiming:
         computation: Time from a step's start to its end, with wake-up and bus.
         bus: Part of the computation from the lock of the bus to the device's answer, with retries; no sample for a node
             without a device, and in logs without bus times.
-        bus_wait: Time that a step waits for the lock of the bus.
         age: Input -> time from the sending of the newest used message to the step's start.
         overruns: Number of steps that ended after the start of the next slot; None if they were not counted.
     """
@@ -75,39 +74,6 @@ class NodeTiming:
     age: Mapping[str, Spread]
     overruns: int | None = None
     bus: Spread = NONE
-    bus_wait: Spread = NONE
-
-
-@dataclass(frozen=True)
-class ConnectionTiming:
-    """The messages of one connection.
-
-    Attributes:
-        unread: Number of messages that no step used, as newer ones came or the episode ended.
-        transport: Time from sending to receipt.
-    """
-
-    reader: str
-    input: str
-    messages: int
-    unread: int
-    transport: Spread
-
-
-@dataclass(frozen=True)
-class BusTiming:
-    """Transactions, losses and late answers on a device's bus.
-
-    Attributes:
-        late: Number of answers with an uncertain sample time, or after a repeated request.
-        lateness: Time of an answer beyond the time of its bytes.
-    """
-
-    transactions: int
-    lost: int
-    retries: int
-    late: int
-    lateness: Spread
 
 
 @dataclass(frozen=True, repr=False)
@@ -115,19 +81,12 @@ class Timing(Shown):
     """The timing of one session.
 
     Attributes:
-        bus: The bus; None without a bus, as in an imported log.
-        stamps: Node -> ``recorded`` or, in an imported log, ``generated`` from a rate.
-        monotonic_ns: Time 0 of the session on the computer's monotonic clock [ns]; None if unknown.
         steps_s: Node -> duration of each step ``(N,)`` [s], in order.
         bus_s: Node -> duration of each bus transaction ``(T,)`` [s], in order.
         transport_s: ``reader/input`` -> transport time of each message ``(M,)`` [s], in order.
     """
 
     nodes: Mapping[str, NodeTiming]
-    connections: tuple[ConnectionTiming, ...]
-    bus: BusTiming | None = None
-    stamps: Mapping[str, str] = field(default_factory=dict)
-    monotonic_ns: int | None = None
     steps_s: Mapping[str, np.ndarray] = field(default_factory=dict)
     bus_s: Mapping[str, np.ndarray] = field(default_factory=dict)
     transport_s: Mapping[str, np.ndarray] = field(default_factory=dict)
@@ -140,21 +99,13 @@ class Timing(Shown):
         counted: Mapping[str, Json] = end.get("timing", {})
         # A session's own summary has the nodes in their graph's order, with overruns; other logs lack only that.
         names = [*(n for n in counted if n in episode.steps), *(n for n in episode.steps if n not in counted)]
-        stamps = episode.metadata.get("stamps", {})
         # The times on the bus, in seconds, of the log's nodes.
-        bus = {
-            n: {kind: np.asarray(us, np.float64) * 1e-6 for kind, us in use.items()}
-            for n, use in end.get("bus", {}).items()
-            if n in episode.steps
-        }
+        used: Mapping[str, Json] = end.get("bus", {})
+        bus = {n: np.asarray(use["transfer_us"], np.float64) * 1e-6 for n, use in used.items() if n in episode.steps}
         return Timing(
-            nodes={n: _node(episode, n, counted.get(n, {}).get("overruns"), bus.get(n, {})) for n in names},
-            connections=tuple(_connection(episode, *key) for key in episode.messages),
-            bus=_bus(end) if "transactions" in end else None,
-            stamps={n: stamps.get(n, "recorded") for n in names},
-            monotonic_ns=end.get("monotonic_ns"),
+            nodes={n: _node(episode, n, counted.get(n, {}).get("overruns"), bus.get(n)) for n in names},
             steps_s={n: (s.end - s.start) / TICKS_PER_S for n, s in episode.steps.items()},
-            bus_s={n: use["transfer_us"] for n, use in bus.items()},
+            bus_s=bus,
             transport_s={f"{r}/{i}": (m.received - m.sent) / TICKS_PER_S for (r, i), m in episode.messages.items()},
         )
 
@@ -228,7 +179,7 @@ class Timing(Shown):
         return replace(timing, **kinds)
 
 
-def _node(episode: Episode, name: str, overruns: int | None, bus: Mapping[str, np.ndarray]) -> NodeTiming:
+def _node(episode: Episode, name: str, overruns: int | None, bus_s: np.ndarray | None) -> NodeTiming:
     steps = episode.steps[name]
     return NodeTiming(
         steps=len(steps),
@@ -237,22 +188,5 @@ def _node(episode: Episode, name: str, overruns: int | None, bus: Mapping[str, n
         computation=Spread.of((steps.end - steps.start) / TICKS_PER_S),
         age={n: Spread.of(ages) for n, ages in input_ages(episode, name).items()},
         overruns=overruns,
-        bus=Spread.of(bus["transfer_us"]) if bus else NONE,
-        bus_wait=Spread.of(bus["wait_us"]) if bus else NONE,
-    )
-
-
-def _connection(episode: Episode, reader: str, name: str) -> ConnectionTiming:
-    messages = episode.messages[reader, name]
-    transport = Spread.of((messages.received - messages.sent) / TICKS_PER_S)
-    return ConnectionTiming(reader, name, len(messages), int((messages.seq_in < 0).sum()), transport)
-
-
-def _bus(end: Mapping[str, Json]) -> BusTiming:
-    return BusTiming(
-        transactions=int(end.get("transactions", 0)),
-        lost=int(end.get("lost_replies", 0)),
-        retries=int(end.get("retries", 0)),
-        late=int(end.get("late_replies", 0)),
-        lateness=Spread(*(end.get("late_s") or (None, None, None))),
+        bus=NONE if bus_s is None else Spread.of(bus_s),
     )

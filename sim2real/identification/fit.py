@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from sim2real.artifacts.identification import Refinement, Search
+from sim2real.artifacts.identification import Search
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode
 from sim2real.identification.config import FitConfig
@@ -109,9 +109,7 @@ class Fit:
     @property
     def record(self) -> Search:
         """How search and refinement went, for the artifact."""
-        refined = tuple(Refinement(r.before, r.loss, r.steps) for r in self.refined)
-        record = self.search.record if self.search else Search()
-        return replace(record, refined=refined, engine=str(self.problem.engine))
+        return replace(self.search.record if self.search else Search(), engine=str(self.problem.engine))
 
     def uncertainty(self) -> Uncertainty:
         """Return how uncertain the estimate is."""

@@ -139,8 +139,7 @@ def errors(
                 pick = (columns["held_out"] == held_out) & (ahead > 0) & (ahead <= horizon_s)
                 off = {n: (p - columns[f"{n}_measured"])[pick] for n, p in predicted.items()}
                 rmse = {n: float(np.sqrt(np.mean(o**2))) if o.size else None for n, o in off.items()}
-                mae = {n: float(np.mean(np.abs(o))) if o.size else None for n, o in off.items()}
-                rows.append(Prediction(model, horizon_s, held_out, rmse, mae))
+                rows.append(Prediction(model, horizon_s, held_out, rmse))
     return rows
 
 
@@ -173,8 +172,8 @@ def free_runs(
                 if predicted is None:
                     continue
                 off = (predicted - columns[f"{name}_measured"])[pick]
-                rmse, mae = float(np.sqrt(np.mean(off**2))), float(np.mean(np.abs(off)))
-                rows.append(FreeRun(model, recording, float(t[0]), float(t[-1] - t[0]), held_out, name, rmse, mae))
+                rmse = float(np.sqrt(np.mean(off**2)))
+                rows.append(FreeRun(model, recording, float(t[0]), float(t[-1] - t[0]), held_out, name, rmse))
     return rows
 
 

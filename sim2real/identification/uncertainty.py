@@ -238,9 +238,6 @@ def determined(problem: Problem, at: Linearised, without: Collection[str] = ()) 
     J[:, held] = 0.0
     information = J.T @ J
     weights, axes = np.linalg.eigh(information)
-    largest, gone = float(weights[-1]), int(held.sum())  # absent parameters have weight 0 by construction
-    least = float(weights[gone]) if gone < len(weights) else largest
-    condition = float(np.sqrt(largest / max(least, largest * 1e-14, 1e-300)))
     # Compute the standard errors to expect from one minute of such data.
     prior = at.prior * np.outer(table.span, table.span)
     duration_s = problem.segment_s * len(problem.train)
@@ -259,7 +256,7 @@ def determined(problem: Problem, at: Linearised, without: Collection[str] = ()) 
             messages.append(f"nothing in this data determines {', '.join(names)}: excite it, fix it or give it a prior")
     undetermined = tuple(tuple(table.names[i] for i in g) for g in groups)
     expected = dict(zip(table.names, minute.tolist(), strict=True))
-    return Determined(condition, undetermined, tuple(messages), expected)
+    return Determined(undetermined, tuple(messages), expected)
 
 
 def _groups(directions: np.ndarray) -> list[list[int]]:

@@ -168,7 +168,6 @@ def _parameters(result: Identification) -> list[Block]:
     if result.check:
         check = result.check
         items = [sentence(m) for m in check.messages] or ["The data determines each parameter."]
-        items.append(f"Condition number of the Jacobian, in widths of the bounds: {number(check.condition, 2)}.")
         blocks.append(ListBlock("Determined by the data", items))
         errors = check.standard_error_per_minute
         rows = [_minute(e, value) for e in result.parameters if (value := errors.get(e.name)) is not None]
@@ -317,9 +316,10 @@ def tried_blocks(result: Identification) -> list[Block]:
 
 def _correlation(result: Identification) -> list[Block]:
     """Return the strong correlations, of which the data determines only combinations."""
-    if not result.correlation:
+    if result.posterior is None:
         return []
-    names, matrix = result.correlation.names, result.correlation.matrix
+    names, deviations = result.posterior.names, np.sqrt(np.diag(result.posterior.covariance))
+    matrix = result.posterior.covariance / np.maximum(np.outer(deviations, deviations), 1e-300)
     pairs = [(names[j], names[i], float(matrix[i, j])) for i in range(len(names)) for j in range(i)]
     strong = sorted((p for p in pairs if abs(p[2]) > _STRONG), key=lambda p: -abs(p[2]))
     caption = f"Correlations beyond ±{_STRONG:g}: the data hardly separates the two estimates"
@@ -427,12 +427,12 @@ def _predictions(result: Identification) -> list[Block]:
         rows = [
             [
                 *(r.model, *([_title(result, r.recording)] if several else []), r.field, number(r.seconds, 3)),
-                *(number(r.rmse), number(r.mae), unit_of(r.field, result.units) or MISSING),
+                *(number(r.rmse), unit_of(r.field, result.units) or MISSING),
             ]
             for r in result.free_run
         ]
-        heads = ("model", *(["recording"] if several else []), "field", "length [s]", "RMSE", "MAE", "unit")
-        text = (1, 2, 6) if several else (1, 5)
+        heads = ("model", *(["recording"] if several else []), "field", "length [s]", "RMSE", "unit")
+        text = (1, 2, 5) if several else (1, 4)
         blocks.append(TableBlock("Free runs", heads, rows, text, folded=True))
     return blocks
 

@@ -17,11 +17,11 @@ from sim2real.artifacts.bundle import History
 from sim2real.artifacts.deployment import Deployment
 from sim2real.artifacts.episodes import Episodes, Varied
 from sim2real.artifacts.files import plain, read_arrays, read_json, write_arrays, write_json
-from sim2real.artifacts.identification import Estimate, Identification, Judgement, Matrix, Noise
+from sim2real.artifacts.identification import Estimate, Identification, Judgement, Noise
 from sim2real.artifacts.posterior import Posterior
 from sim2real.artifacts.run import Manifest, Source, StageFolder, write_manifest
 from sim2real.artifacts.sensitivity import Sensitivity
-from sim2real.artifacts.timing import NONE, ConnectionTiming, NodeTiming, Spread, Timing
+from sim2real.artifacts.timing import NONE, NodeTiming, Spread, Timing
 from sim2real.errors import Sim2RealError
 
 FILES = (Deployment, Episodes, History, Identification, Sensitivity, Timing)
@@ -44,7 +44,7 @@ ODD = [
 ]
 BESIDE = ("recordings", "simulated", "probe", "samples", "free", "timing")
 """Fields that lie in files of their own."""
-SQUARE = {History: ("returns", "success"), Matrix: ("matrix",)}
+SQUARE = {History: ("returns", "success")}
 NUMBERS = (math.inf, -math.inf, math.nan, 1e308, -0.0, 5e-324, 0.1)
 
 
@@ -180,14 +180,12 @@ IDENTIFIED = Identification(
     (Source("record/session.mcap", "ab" * 32),),
     Judgement("accepted", ("because",), "sim2real train pendulum"),
     (Estimate("gain", "1", "dynamics", "about", 2.0, 0.1 + 0.2, "accepted", np.inf, None, 1e-300),),
-    correlation=Matrix(("gain",), np.ones((1, 1))),
     posterior=POSTERIOR,
     samples=COLUMNS,
     free={n: v[:2] for n, v in COLUMNS.items()},
 )
 TIMED = Timing(
     {"agent": NODE, "sensor": NODE},
-    (ConnectionTiming("agent", "sensor", 2, 0, NONE),),
     steps_s={"agent": np.array([0.001, 0.003]), "sensor": np.array([0.002])},
     bus_s={"sensor": np.array([4e-4])},
     transport_s={"agent/sensor": np.array([1e-5])},
@@ -223,7 +221,6 @@ def test_a_folder_gives_back_what_was_saved(artifact, tmp_path):
 DAMAGE = [
     (IDENTIFIED, "parameters.json", {"format": 2}, "format 2"),
     (IDENTIFIED, "parameters.json", {"parameters": [{"name": "gain"}]}, "parameters"),
-    (IDENTIFIED, "parameters.json", {"correlation": {"names": ["a", "b"], "matrix": [[1.0]]}}, "matrix"),
     (IDENTIFIED, "parameters.json", {"verdict": None}, "null"),
     (IDENTIFIED, "parameters.json", {"posterior": {"mean": [0.0]}}, "names"),
     (TIMED, "timing.json", {"format": 3}, "format 3"),

@@ -28,12 +28,12 @@ TWO = (Position("position[0]", "pan", "rad", 0.002), Position("position[1]", "ti
 
 def rows(identified, nominal, horizon_s=1.0, held_out=True, column="th", **others):
     errors = {"identified": identified, "nominal": nominal, **others}
-    return [Prediction(m, horizon_s, held_out, {column: e}, {}) for m, e in errors.items()]
+    return [Prediction(m, horizon_s, held_out, {column: e}) for m, e in errors.items()]
 
 
 def both(first, second):
     """Return rows of two positions; model -> error of each."""
-    return [Prediction(m, 1.0, True, {"position[0]": first[m], "position[1]": e}, {}) for m, e in second.items()]
+    return [Prediction(m, 1.0, True, {"position[0]": first[m], "position[1]": e}) for m, e in second.items()]
 
 
 def spread(misfit=1.0, **verdicts):
@@ -42,7 +42,7 @@ def spread(misfit=1.0, **verdicts):
 
 
 def check(*groups):
-    return Determined(1.0, groups, tuple(f"nothing in this data determines {', '.join(g)}" for g in groups), {})
+    return Determined(groups, tuple(f"nothing in this data determines {', '.join(g)}" for g in groups), {})
 
 
 def judge(prediction, spread=spread(), check=check(), positions=ONE, x=None, **more):  # noqa: B008 - neither changes
@@ -72,7 +72,7 @@ def test_a_baseline_that_diverges_is_no_better(diverged):
 def test_the_longest_horizon_on_held_out_data_decides():
     prediction = rows(2.0, 1.0, horizon_s=0.1) + rows(0.5, 1.0, horizon_s=1.0) + rows(9.0, 1.0, 2.0, held_out=False)
     assert judge(prediction).status == "accepted"
-    nothing = [Prediction("identified", 3.0, True, {"th": None}, {})]
+    nothing = [Prediction("identified", 3.0, True, {"th": None})]
     assert judge(prediction + nothing).status == "accepted"
 
 
@@ -97,7 +97,7 @@ def test_the_worst_position_comes_first_and_all_are_told():
 
 
 def test_where_commands_are_no_positions_nothing_was_told():
-    prediction = [*rows(0.1, 1.0), Prediction("told", 1.0, True, {"other": 0.01}, {})]
+    prediction = [*rows(0.1, 1.0), Prediction("told", 1.0, True, {"other": 0.01})]
     assert judge(prediction).status == "accepted"
 
 

@@ -16,7 +16,7 @@ NOISE = (Noise("x[1]", "rad", 1e-3, 0.0, 0.0),)
 
 
 def run(field, rmse, recording=0, model="identified", held_out=True):
-    return FreeRun(model, recording, 18.0, 6.0, held_out, field, rmse, rmse)
+    return FreeRun(model, recording, 18.0, 6.0, held_out, field, rmse)
 
 
 def document(times_noise, *runs, tried=(), terms=()):

@@ -26,7 +26,7 @@ def recorded(every, long_s, pauses=True):
     period = Spread.of(np.full(3, 1 / RATE_HZ))
     nodes = {n: NodeTiming(COUNT, period, period, Spread.of(s), {}) for n, s in steps.items()}
     transport = {"agent/sensor": np.full(COUNT, 2e-4), "actuator/agent": np.full(COUNT, np.nan)}
-    return RecordedTiming.of(Timing(nodes, (), steps_s=steps, transport_s=transport), RATE_HZ, 0, pauses)
+    return RecordedTiming.of(Timing(nodes, steps_s=steps, transport_s=transport), RATE_HZ, 0, pauses)
 
 
 @pytest.fixture

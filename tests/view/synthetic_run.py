@@ -99,7 +99,6 @@ def parameters(truth: bool = True) -> dict[str, Any]:
         "logs": [{"path": "../record/session.mcap", "sha256": "0" * 64}],
         "verdict": {"status": "change the model", "reasons": ["at a bound: friction", "sensor_delay is <b>loose</b>"]},
         "check": {
-            "condition": 123.4,
             "undetermined": [["sensor_delay", EVIL]],
             "messages": [f"only sensor_delay + {EVIL} is determined: fix one"],
             "standard_error_per_minute": {"friction": 0.004, "sensor_delay": 0.0002},
@@ -111,13 +110,15 @@ def parameters(truth: bool = True) -> dict[str, Any]:
             entry("sensor_delay", "s", "delay", 0.01234, 0.0005, 0.0, 0.0119 if truth else None),
             entry("round_trip_delay", "s", "derived", 0.0448, 0.0001, 0.0, 0.0446 if truth else None),
         ],
-        "correlation": {"names": names, "matrix": (np.eye(3) * 0.5 + 0.5).tolist()},
+        "posterior": {
+            "names": names, "transform": ["linear"] * 3, "mean": [0.0] * 3, "low": [-9.0] * 3, "high": [9.0] * 3,
+            "covariance": (np.eye(3) * 0.5 + 0.5).tolist(),
+        },
         "search": {
             "history": [9.0, 4.0, 1.5, None, 1.0], "evaluations": 1920, "seconds": 12.3,
-            "refined": [{"before": 1.0, "after": 0.9, "steps": 7}],
         },
         "prediction": [
-            {"model": m, "horizon_s": h, "held_out": o, "rmse": {"th": e * (1 + h), "thdot": 5 * e}, "mae": {}}
+            {"model": m, "horizon_s": h, "held_out": o, "rmse": {"th": e * (1 + h), "thdot": 5 * e}}
             for m, e in (("identified", 0.0117), ("no delay", 0.1), ("nominal", 0.29), ("hold", 0.8))
             for h in (0.1, 0.5, 1.0)
             for o in (False, True)
@@ -136,7 +137,7 @@ def parameters(truth: bool = True) -> dict[str, Any]:
         "free_run": [
             {
                 "model": m, "recording": 0, "begin_s": 3.3, "seconds": 1.7, "held_out": True, "field": f,
-                "rmse": e, "mae": 0.8 * e,
+                "rmse": e,
             }
             for m, e in (("identified", 0.0123), ("no delay", 0.15), ("hold", 0.9))
             for f in ("th", "thdot")

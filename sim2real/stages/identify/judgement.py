@@ -20,7 +20,6 @@ from sim2real.artifacts.identification import (
     HeldOutPart,
     Identification,
     Judgement,
-    Matrix,
     Noise,
     TriedTerm,
     with_small_unit,
@@ -193,9 +192,8 @@ def _estimates(
         seconds: Duration of the search [s].
     """
     fit, spread, check = findings.fit, findings.spread, findings.check
-    names = tuple(fit.problem.table.names)
     search = replace(fit.record, seconds=seconds)
-    if not fit.converged:  # away from a minimum no interval, covariance or condition means anything
+    if not fit.converged:  # away from a minimum no interval means anything
         rows = tuple(_without_interval(row) for row in _rows(findings, truth))
         return Identification(
             pipeline=pipeline, logs=(), verdict=Judgement("", ()), parameters=rows, search=search, misfit=spread.misfit
@@ -206,8 +204,6 @@ def _estimates(
         verdict=Judgement("", ()),
         parameters=tuple(_rows(findings, truth)),
         search=search,
-        covariance=Matrix(names, spread.covariance),
-        correlation=Matrix(names, spread.correlation),
         misfit=spread.misfit,
         check=check,
         posterior=posterior,
