@@ -110,6 +110,9 @@ class Log:
         position: Shape ``(N, joints)`` [rad], in the order of the joints.
         goal: Shape ``(N, joints)`` [rad], with the sign that makes the position follow.
         dropped: Samples that must not be imported.
+        range_rad: Angle of 100 percent [rad].
+        places: Column of each joint in arrays of commands without names.
+        turn: Node -> a turn in the unit of its angles.
         marks: What else is odd about it.
     """
 
@@ -125,6 +128,9 @@ class Log:
     position: np.ndarray = field(default_factory=lambda: np.zeros(0))
     goal: np.ndarray = field(default_factory=lambda: np.zeros(0))
     dropped: set = field(default_factory=set)
+    range_rad: float = 0.0
+    places: tuple = ()
+    turn: dict = field(default_factory=dict)
     marks: list = field(default_factory=list)
 
 
@@ -187,12 +193,13 @@ def _write(log, written, commanded, vendor, rng):
     log.units = tuple(rng.choice(["rev", "counts", "percent"] if odd else ["rad", "deg"], 2))
     log.units = log.units if rng.random() < 0.3 else (log.units[0],) * 2
     told = [bool(rng.random() < 0.6) for _ in range(2)]
-    range_rad = rng.uniform(1.2, 3.0)
+    log.range_rad = range_rad = rng.uniform(1.2, 3.0)
     per_rad = {"rad": 1, "deg": 180 / np.pi, "rev": 0.5 / np.pi, "counts": 2048 / np.pi, "percent": 100 / range_rad}
     written, commanded = (x * per_rad[u] for x, u in zip((written, commanded), log.units, strict=True))
     written, commanded = (
         np.round(x) if u == "counts" else x for x, u in zip((written, commanded), log.units, strict=True)
     )
+    log.turn = {n: 2 * np.pi * per_rad[u] for n, u in zip(("sensor", "actuator"), log.units, strict=True)}
     suffix = [SUFFIX[u] if say else "" for u, say in zip(log.units, told, strict=True)]
     order = rng.permutation(n)
     log.named = bool(vendor or rng.random() < 0.6)
@@ -211,6 +218,7 @@ def _write(log, written, commanded, vendor, rng):
         # The program that wrote them did so in one order, or, rarely, in two.
         order = order if rng.random() < 0.5 else np.arange(n)
         log.columns |= {f"goal{suffix[1]}": commanded[:, order], f"q{suffix[0]}": written}
+        log.places = tuple(np.argsort(order).tolist())
         log.joints = tuple(map(str, range(n)))
     if rng.random() < 0.2:
         log.columns["effort" if not log.named else "effort_ja"] = np.full(len(written), np.nan)

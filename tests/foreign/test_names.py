@@ -54,26 +54,18 @@ def test_a_unit_that_no_name_has_is_asked_however_small_or_large_the_motion(tmp_
     np.testing.assert_allclose(episode.outputs["sensor"]["position"], np.radians(degrees * Q), atol=1e-6)
 
 
-@pytest.mark.parametrize("known", ["goal", "velocity", "turn", "range"])
-def test_the_unit_of_a_column_may_follow_from_another_one(tmp_path, known):
-    asked = {}
-    if known == "goal":
-        path = table(tmp_path, "goal_{}_rad", "q_{}")
-    elif known == "velocity":
-        path = table(
-            tmp_path, "goal_{}", "q_{}", dq_a_rad_s=np.gradient(Q[:, 0], T), dq_b_rad_s=np.gradient(Q[:, 1], T)
-        )
-    elif known == "turn":
-        angle = np.stack([0.9 * T + GOAL[:, 0], 0.9 * T + Q[:, 0]], axis=1)
-        path = csv(
-            tmp_path / "run.csv", {"t_s": T, "goal_a": angle[:, 0] % (2 * np.pi), "q_a": angle[:, 1] % (2 * np.pi)}
-        )
-    else:
-        path = table(tmp_path, "goal_{}", "q_{}", factor=1.0)
-        columns = {"t_s": T, "goal_a": GOAL[:, 0] - 1.5, "q_a": Q[:, 0] - 1.5}
-        path = csv(tmp_path / "run.csv", columns)
-        asked = {"joints": ("a",), "ranges": np.array([[-2.7, -0.5]])}
-    assert proposed(path, **asked).mapping.nodes["sensor"].fields["position"].unit == "rad"
+@pytest.mark.parametrize("factor", [1.0, 180 / np.pi])
+@pytest.mark.parametrize(
+    ("goal", "q", "asked"), [("goal_{}_rad", "q_{}", "sensor"), ("goal_{}", "q_{}_rad", "actuator")]
+)
+def test_a_unit_of_one_side_holds_for_the_other_unless_the_data_contradict_it(tmp_path, goal, q, asked, factor):
+    path = table(tmp_path, goal, q)
+    named, unnamed = (GOAL, Q) if asked == "sensor" else (Q, GOAL)
+    columns = {"t_s": T} | {(goal if named is GOAL else q).format(j): named[:, i] for i, j in enumerate("ab")}
+    columns |= {(q if named is GOAL else goal).format(j): factor * unnamed[:, i] for i, j in enumerate("ab")}
+    found = proposed(csv(path, columns))
+    assert {key[:1] + key[2:] for key in found.questions} == ({(asked, "unit")} if factor > 1 else set())
+    assert found.mapping.nodes["sensor"].fields["position"].unit == "rad"
 
 
 @pytest.mark.parametrize("suffix", ["_ticks", "_percent"])

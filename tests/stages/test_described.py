@@ -30,8 +30,8 @@ NEW = ["new", "rig", "--mjcf", "robot.xml", "--log", "run.npz"]
 @pytest.fixture(scope="module")
 def recorded():
     t = np.arange(1000) / RATE_HZ
-    goal = np.stack([0.4 * np.sin(3.1 * t), 0.3 * np.sin(5.7 * t + 1.0)], axis=1)
-    q = 0.98 * np.stack([0.4 * np.sin(3.1 * (t - 0.04)), 0.3 * np.sin(5.7 * (t - 0.04) + 1.0)], axis=1)
+    wave = lambda t: np.stack([0.4 * np.sin(3.1 * t), 0.5 + 0.3 * np.sin(5.7 * t + 1.0)], axis=1)  # noqa: E731
+    goal, q = wave(t), 0.98 * wave(t - 0.04)
     return t, goal, q
 
 

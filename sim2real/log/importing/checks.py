@@ -12,13 +12,17 @@ from typing import Literal
 
 import numpy as np
 
+from sim2real.graph.episode import Episode
 from sim2real.later import Later
 from sim2real.leaps import reach_rad
+from sim2real.log.importing.names import meaning
 
 ndimage = Later("scipy.ndimage")
 TURN_RAD = 2.0 * np.pi
 _MAX_ROWS = 6000
 """Compared rows; a longer recording is thinned."""
+_FINER = 4
+"""Compared rows for each sample."""
 _LAGS_S = (-0.3, 0.6)
 _FOLLOWS_R = 0.8
 """A position follows a command from this correlation on."""
@@ -58,7 +62,7 @@ class Response:
         slope: Shape ``(L, joints, commands)``: of positions over commands.
         misfit: Shape ``(2, L, joints, commands)``: error of the command, and of its opposite, over the spread.
         moves: Shape ``(joints,)``: whether position and command of the same number move.
-        period_s: Time between compared rows [s].
+        period_s: Time between samples of the faster side [s].
     """
 
     lag_s: np.ndarray
@@ -89,12 +93,16 @@ def respond(
         position: Shape ``(M, joints)``.
         acting: Shape ``(N,)``: whether commands act; None: all do.
     """
-    grid, held, joined, live = _on_grid(t_s, command, position, acting)
-    if live.sum() < 50:
+    # Finer than the samples, as a fast tone turns its sign within two of them.
+    grid, held, joined, live = _on_grid(t_s, command, position, acting, _FINER)
+    if len(grid) < 2 or live.sum() * (grid[1] - grid[0]) < 50 * (
+        sample_s := min(float(np.median(np.diff(t))) for t in t_s)
+    ):
         return None
     period_s = float(grid[1] - grid[0])
     lags = np.arange(round(_LAGS_S[0] / period_s), round(_LAGS_S[1] / period_s) + 1)
-    lags = lags[np.abs(lags) < len(grid) - 50]
+    least = round(50 * sample_s / period_s)
+    lags = lags[np.abs(lags) < len(grid) - least]
     # At a lag, sum over the rows at which both the command then and the position now are known: by FFT, for all lags.
     centre = [x[live].mean(axis=0) for x in (held, joined)]  # for the precision of the sums
     c, q = (np.where(live[:, None], x - m, 0.0) for x, m in zip((held, joined), centre, strict=True))
@@ -112,7 +120,7 @@ def respond(
     cov = both / count[:, :, None] - my[:, :, None] * mx[:, None, :]
     slope = cov / vx[:, None, :]
     r = cov / np.sqrt(vx[:, None, :] * vy[:, :, None])
-    r[count[:, 0] < 50] = 0.0
+    r[count[:, 0] < least] = 0.0
     level = [(my + centre[1])[:, :, None] - sign * (mx + centre[0])[:, None, :] for sign in (1.0, -1.0)]
     square = [
         vy[:, :, None] + vx[:, None, :] - 2 * sign * cov + at**2 for sign, at in zip((1.0, -1.0), level, strict=True)
@@ -120,7 +128,7 @@ def respond(
     misfit = np.sqrt(np.maximum(np.stack(square), 0.0) / vy[:, :, None])
     both = min(q.shape[1], c.shape[1])
     moves = (q[live].std(axis=0) > _STILL)[:both] & (c[live].std(axis=0) > _STILL)[:both]
-    return Response(lags * period_s, r, slope, misfit, moves, period_s)
+    return Response(lags * period_s, r, slope, misfit, moves, sample_s)
 
 
 def check(
@@ -150,7 +158,6 @@ def check(
     moving = np.flatnonzero(found.moves)
     copies = copied(*t_s, goal, position)
     lags: dict[int, float] = {}
-    unsure: list[int] = []
     for i in range(len(names)):
         if copies[i]:
             text = f"{names[i]}: its goals are copies of its measurements, so they hold no information on the drive"
@@ -162,16 +169,6 @@ def check(
             findings += own
             if lag_s is not None:
                 lags[i] = lag_s
-            elif any(f.kind == "sign" and f.weight == "ask" for f in own):
-                unsure.append(i)
-    # Joints share the delay of their robot: where both signs fit, the one with the lag of the others is right.
-    if lags and unsure:
-        usual = float(np.median(list(lags.values())))
-        for i in unsure:
-            near = [abs(found.best(i, i, sign)[1] - usual) < 0.02 + 1.5 * found.period_s for sign in (1.0, -1.0)]
-            if near == [True, False]:
-                findings = [f for f in findings if (f.kind, f.joint) != ("sign", i)]
-                lags[i] = found.best(i, i, 1.0)[1]
     following = [i for i in lags if not copies[i]]
     clock = _clock(t_s, goal, position, following or moving.tolist(), acting)
     if any(f.weight == "refuse" for f in clock):
@@ -189,6 +186,56 @@ def check(
     if moving.size:
         findings += _rates(t_s, goal, position, moving.tolist())
     return findings + _scales(position, names)
+
+
+def check_episode(episode: Episode, joints: Sequence[str] = (), by_name: bool = True) -> list[Finding]:
+    """Compare the goals and positions of an imported episode; see ``check``."""
+    sensed, commands = episode.outputs.get("sensor", {}), episode.outputs.get("actuator", {})
+    units = {**episode.units.get("actuator", {}), **episode.units.get("sensor", {})}
+    enabled = [values for name, values in commands.items() if meaning(name).quantity == "enabled"]
+    acting = np.asarray((enabled[0].reshape(len(enabled[0]), -1) > 0).all(axis=1)) if len(enabled) == 1 else None
+    findings: list[Finding] = []
+    for name, position in sensed.items():
+        for goal, values in commands.items():
+            pair = meaning(name).quantity == "position" and meaning(goal).side == "command"
+            if not (pair and meaning(goal).quantity in ("", "position") and units.get(goal) == units.get(name)):
+                continue
+            flat = values.reshape(len(values), -1), position.reshape(len(position), -1)
+            if flat[0].shape[1] == flat[1].shape[1]:
+                names = joints if len(joints) == flat[1].shape[1] else [f"joint {i}" for i in range(flat[1].shape[1])]
+                t_s = episode.steps["actuator"].begun_s, episode.steps["sensor"].begun_s
+                findings += check(t_s, *flat, names, by_name, acting)
+    return findings
+
+
+_HINTS = {
+    "sign": "change the sign of that joint's scale, such as scale = [1, -1]",
+    "order": "list the sources in the order of the positions",
+    "copy": "log the commands that were sent, not the measurements",
+    "clock": "stamp both streams with one clock, such as a recorder's",
+    "zero": "cut the file where the zero moves: --samples A:B",
+    "scale": "name the other joints with --joints, or give the column its own scale in a mapping",
+    "slope": "correct the unit, or name the other joints with --joints",
+    "lag": "exchange the names, or correct stamp_offset",
+}
+
+
+def hint_for(findings: Sequence[Finding]) -> str:
+    """Return what to do about findings that refuse an import."""
+    hints = dict.fromkeys(_HINTS.get(f.kind, "correct the mapping") for f in findings)
+    return "; ".join(hints) + "; --as-told imports it all the same"
+
+
+def is_rate(t_s: np.ndarray, angle: np.ndarray, velocity: np.ndarray) -> bool:
+    """Return whether velocities ``(N, joints)`` are the rate of angles, in the same unit."""
+    rows = np.isfinite(angle).all(axis=1) & np.isfinite(velocity).all(axis=1) & np.isfinite(t_s)
+    if rows.sum() < 50 or (np.diff(t_s[rows]) <= 0).any():
+        return False
+    rate = np.gradient(angle[rows], t_s[rows], axis=0)
+    rate, v = (ndimage.uniform_filter1d(x, 5, axis=0)[3:-3] for x in (rate, velocity[rows]))
+    moving = v.std(axis=0) > 1e-9
+    x, y = v[:, moving].ravel(), rate[:, moving].ravel()
+    return bool(moving.any() and np.corrcoef(x, y)[0, 1] > 0.8 and 0.8 < (x @ y) / (x @ x) < 1.25)
 
 
 def _own(found: Response, i: int, names: Sequence[str], by_name: bool) -> tuple[list[Finding], float | None]:
@@ -327,18 +374,7 @@ def _zero(
         """Return what the goals do not explain of values without a mean."""
         return values - taps @ np.linalg.solve(gram, taps.T @ values)
 
-    # A reading that leaps within one sample, and stays: friction and loads change the rest more slowly.
-    rest, leap_s = rest_of(centred), round(0.5 / period_s)
-    jumps = np.diff(q, prepend=q[:1])
-    k = int(np.argmax(np.abs(jumps)))
-    before, after = rest[max(k - leap_s, 0) : k], rest[k : k + leap_s]
-    if min(len(before), len(after)) > 5:
-        size = float(np.median(after) - np.median(before))
-        leaps = abs(jumps[k]) > 3.0 * float(np.partition(np.abs(jumps), -3)[-3]) and abs(jumps[k]) > 0.03
-        if leaps and 0.6 < size / jumps[k] < 1.6:
-            size = float(jumps[k] - np.median(jumps[max(k - 4, 0) : k]))
-            text = f"{name} steps by {size:+.3f} rad within one sample at {at[k] - t_s[1][0]:.2f} s, and stays"
-            return [Finding("zero", i, f"{text}: its zero has moved; cut the file there with --samples", "refuse")]
+    rest = rest_of(centred)
     # A change of the rest that lasts to the end: a slip, or a zero of the goals that moves.
     total, count = np.cumsum(rest), np.arange(1, len(rest) + 1)
     inside = slice(len(rest) // 20, -max(len(rest) // 20, 1))
@@ -352,9 +388,10 @@ def _zero(
     std, k, size, left = min(fits, key=lambda fit: fit[0])
     blocks = np.array([b.mean() for b in np.array_split(left, max(8, int(np.ptp(at) / 1.0)))])
     if abs(size) > 0.03 and abs(size) > 5.0 * blocks.std() and std < 0.8 * rest.std():
+        leaps = abs(size) > 0.1 and 0.6 < (q[k] - q[k - 1]) / size < 1.6
         since = f"{at[k] - t_s[1][0]:.2f} s on: one of them has another zero"
         text = f"{name} reads {size:+.3f} rad against its goal from {since}"
-        return [Finding("zero", i, text, "warn")]
+        return [Finding("zero", i, text, "refuse" if leaps else "warn")]
     shift = round(lag_s / period_s)
     error = joined[max(shift, 0) :, 0] - held[: n - max(shift, 0), 0]
     offset = float(np.median(error))
@@ -525,7 +562,7 @@ def glitches(t_s: np.ndarray, angle: np.ndarray) -> np.ndarray:
         return found
     steps_s = np.diff(t_s)
     period_s = float(np.median(steps_s))
-    half = int(np.clip(np.ceil(0.05 / period_s), 3, 15))  # a glitch is shorter than 50 ms, and than 15 samples
+    half = int(np.clip(np.ceil(0.05 / period_s), 2, 15))  # a glitch is shorter than 50 ms, and than 15 samples
     for i, column in enumerate(angle.T):
         middle = ndimage.median_filter(column, 2 * half + 1, mode="reflect")
         fastest = max(0.5, 1.5 * float((np.abs(np.diff(middle)) / steps_s).max()))
@@ -557,14 +594,18 @@ def leap(t_s: np.ndarray, angle: np.ndarray) -> tuple[int, int, float] | None:
 
 
 def _on_grid(
-    t_s: tuple[np.ndarray, np.ndarray], command: np.ndarray, position: np.ndarray, acting: np.ndarray | None
+    t_s: tuple[np.ndarray, np.ndarray],
+    command: np.ndarray,
+    position: np.ndarray,
+    acting: np.ndarray | None,
+    finer: int = 1,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return a grid of time, held commands, interpolated positions, and whether commands act."""
+    """Return a grid with some rows a sample, held commands, interpolated positions, and whether commands act."""
     begin, end = max(t[0] for t in t_s), min(t[-1] for t in t_s)
     if not end > begin:
         none = np.zeros(0)
         return none, none[:, None], none[:, None], none.astype(bool)
-    period_s = max(min(float(np.median(np.diff(t))) for t in t_s), (end - begin) / _MAX_ROWS)
+    period_s = max(min(float(np.median(np.diff(t))) for t in t_s) / finer, (end - begin) / _MAX_ROWS)
     grid = np.arange(begin, end + 1e-9, period_s)
     newest = np.clip(np.searchsorted(t_s[0], grid + 1e-6, side="right") - 1, 0, None)
     joined = np.stack([np.interp(grid, t_s[1], column) for column in position.T], axis=1)

@@ -196,3 +196,17 @@ def conversion(calibration: Path, joints: Sequence[str], unit: str) -> tuple[lis
             scales.append((-1 if mirrored else 1) * (_COUNTS - 1) / 360 * 2 * math.pi / _COUNTS)
             offsets.append(0.0)
     return scales, offsets
+
+
+def unit_of(calibration: Path, joints: Sequence[str], values: np.ndarray) -> str | None:
+    """Return the unit in which positions ``(N, joints)`` are whole counts by a calibration; None if unclear."""
+    arm = [i for i, joint in enumerate(joints) if not is_gripper(joint)]
+    fits = []
+    for unit in UNITS:
+        scale, _ = conversion(calibration, [joints[i] for i in arm], unit)
+        halves = (
+            2 * values[:, arm] * np.array(scale) * _COUNTS / (2 * math.pi)
+        )  # the middle of a range can be half a count
+        if float(np.quantile(np.abs(halves - np.round(halves)), 0.95)) < 0.05:
+            fits.append(unit)
+    return fits[0] if len(fits) == 1 else None

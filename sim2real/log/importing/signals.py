@@ -1,4 +1,4 @@
-"""The signals of a table, grouped by the meaning of their names, with their clocks, and the draft of a mapping."""
+"""The signals of a table, grouped by the meaning of their names, with their clocks; and the draft of a mapping."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ _RATES_HZ = (5.0, 12_000.0)
 """Usual sampling rates of recorders."""
 _WALL_S = (1e9, 4e9)
 """Wall clocks read this many seconds since 1970 (2001 to 2096)."""
+_APART_S = 0.02
+"""Two clocks of one topic that disagree by more are a question."""
 
 Key = tuple[str, str, str]
 """Node, field or empty, and key of a line of a mapping file."""
@@ -32,7 +34,6 @@ class ImportHints:
         pipeline: Name of the log's pipeline.
         rate_hz: Rate of the samples if the file has no stamps [Hz].
         joints: Names of the robot's joints, in its order; empty if unknown.
-        ranges: Shape ``(joints, 2)``: limits of the joints [rad]; None if unknown.
         as_told: Keep names, order, signs and units, even if they are ambiguous or contradict the data.
         slides: Names of the sliding joints, whose positions are lengths.
         unit: Unit of positions and goals in the file; empty: by their names.
@@ -42,50 +43,10 @@ class ImportHints:
     pipeline: str
     rate_hz: float | None = None
     joints: tuple[str, ...] = ()
-    ranges: np.ndarray | None = None
     as_told: bool = False
     slides: tuple[str, ...] = ()
     unit: str = ""
     calibration: Path | None = None
-
-
-@dataclass(frozen=True)
-class Signal:
-    """Columns that belong together.
-
-    Attributes:
-        sources: Source of each column, as in a mapping.
-        labels: Joint of each column; empty if its name has none.
-        meaning: Meaning of the name.
-        values: Shape ``(N, columns)``; ``(columns,)`` for constants.
-        whole: Source of all columns together; None if they are separate signals of the file.
-    """
-
-    sources: tuple[str, ...]
-    labels: tuple[str, ...]
-    meaning: Meaning
-    values: np.ndarray
-    whole: str | None = None
-
-    @property
-    def name(self) -> str:
-        """Name for messages."""
-        return self.whole or ", ".join(self.sources[:3]) + (" ..." if len(self.sources) > 3 else "")
-
-    @property
-    def width(self) -> int:
-        """Number of columns."""
-        return len(self.sources)
-
-    def taken(self, places: Sequence[int]) -> Signal:
-        """Return some of the columns, in this order."""
-        whole = self.whole if list(places) == list(range(self.width)) else None
-        sources, labels = (tuple(part[i] for i in places) for part in (self.sources, self.labels))
-        return Signal(sources, labels, self.meaning, self.values[..., list(places)], whole)
-
-    def mapped(self, unit: str, **more: Any) -> FieldMapping:
-        """Return the field that has these columns."""
-        return FieldMapping(self.whole or self.sources, unit, shape=(-1,), **more)
 
 
 @dataclass
@@ -110,8 +71,7 @@ class Proposal:
         head = [f"Proposed by `sim2real import {name}`.", *self.evidence, f"Joints: {', '.join(self.joints)}"]
         if self.questions:
             head.insert(
-                1,
-                "Put an answer in place of each line with a question mark, then give this file to --mapping.",
+                1, "Put an answer in place of each line with a question mark, then give this file to --mapping."
             )
         return to_toml(self.mapping, head, self.reasons, self.questions)
 
@@ -121,6 +81,42 @@ class Proposal:
             f"nodes.{node}.{f'fields.{name}.' * bool(name)}{key} = {text}"
             for (node, name, key), text in self.questions.items()
         ]
+
+
+@dataclass(frozen=True)
+class Signal:
+    """Columns that belong together.
+
+    Attributes:
+        sources: Source of each column, as in a mapping.
+        labels: Joint of each column; empty if its name has none.
+        values: Shape ``(N, columns)``; ``(columns,)`` for constants.
+        whole: Source of all columns together; None if they are separate signals of the file.
+    """
+
+    sources: tuple[str, ...]
+    labels: tuple[str, ...]
+    meaning: Meaning
+    values: np.ndarray
+    whole: str | None = None
+
+    @property
+    def name(self) -> str:
+        return self.whole or ", ".join(self.sources[:3]) + (" ..." if len(self.sources) > 3 else "")
+
+    @property
+    def width(self) -> int:
+        return len(self.sources)
+
+    def taken(self, places: Sequence[int]) -> Signal:
+        """Return some of the columns, in this order."""
+        whole = self.whole if list(places) == list(range(self.width)) else None
+        sources, labels = (tuple(part[i] for i in places) for part in (self.sources, self.labels))
+        return Signal(sources, labels, self.meaning, self.values[..., list(places)], whole)
+
+    def mapped(self, unit: str, **more: Any) -> FieldMapping:
+        """Return the field that has these columns."""
+        return FieldMapping(self.whole or self.sources, unit, shape=(-1,), **more)
 
 
 def collect(table: Table) -> tuple[list[Signal], list[str]]:
@@ -146,8 +142,7 @@ def collect(table: Table) -> tuple[list[Signal], list[str]]:
         if values.size and values.ndim <= 2 and not np.isfinite(values).any():
             notes.append(f"skipped: {key!r} has no number in any sample")
         elif values.ndim <= 1:
-            label = _label_of(key, named, table)
-            row = Signal((key,), (label,), named, values[..., None])
+            row = Signal((key,), (_label_of(key, named, table),), named, values[..., None])
             group = replace(named, label=""), values.size if values.ndim else 0, _group(key)
             single.setdefault(group, []).append(row)
         elif values.ndim == 2 and values.shape[1] <= 1000:
@@ -160,15 +155,17 @@ def collect(table: Table) -> tuple[list[Signal], list[str]]:
     for (named, _, _), rows in single.items():
         labels = [row.labels[0] for row in rows]
         together = len(rows) > 1 and len(set(labels)) == len(labels) and "" not in labels and named.quantity != "stamp"
-        if together and (named.side or named.quantity):
-            values = np.concatenate([row.values for row in rows], axis=-1)
-            whole = Signal(tuple(row.sources[0] for row in rows), tuple(labels), named, values)
-            # Numbers count the joints.
-            if are_numbers(labels):
-                whole = whole.taken(sorted(range(len(labels)), key=lambda i: int(re.findall(r"\d+", labels[i])[0])))
-            signals.append(whole)
-        else:
+        if not together or not (named.side or named.quantity):
             signals += rows
+            continue
+        values = np.concatenate([row.values for row in rows], axis=-1)
+        signal = Signal(tuple(row.sources[0] for row in rows), tuple(labels), named, values)
+        numbered = (
+            sorted(range(len(labels)), key=lambda i: int(re.findall(r"\d+", labels[i])[0]))
+            if are_numbers(labels)
+            else None
+        )
+        signals.append(signal.taken(numbered) if numbered else signal)
     if words := [key for key in table.words if key not in lists and len(set(table.words[key])) > 1]:
         notes.append(f"skipped, as they hold no numbers: {', '.join(words[:20])}")
     return signals, notes
@@ -203,62 +200,75 @@ def _lists_for(key: str, width: int, lists: Mapping[str, list[str]], table: Tabl
     return best
 
 
+def _group(key: str) -> str:
+    """Return the topic of a signal in a bag, or the file of one of several; empty for others."""
+    return key.partition(".")[0] if key.startswith("/") else key.partition("/")[0] if "/" in key else ""
+
+
+# -- clocks
+
+
 def stamped(
-    signals: Sequence[Signal], of: Signal, side: str, node: str, table: Table, hints: ImportHints, draft: Proposal
+    signals: Sequence[Signal], of: Signal, node: str, table: Table, hints: ImportHints, draft: Proposal
 ) -> tuple[dict[str, Any], np.ndarray]:
     """Return the keys of a node's clock, and its stamps [s]."""
     count = len(of.values)
-    generated = {"rate_hz": hints.rate_hz or 1.0}, np.arange(count) / (hints.rate_hz or 1.0)
     if hints.rate_hz is not None:
         draft.reasons[node, "", "rate_hz"] = "--rate-hz"
-        return generated
+        return {"rate_hz": hints.rate_hz}, np.arange(count) / hints.rate_hz
     named = [s for s in signals if s.meaning.quantity == "stamp" and s.width == 1 and s.values.shape == (count, 1)]
     fitting = [s for s in named if _increases(s.values[:, 0])]
-    chosen = [s for s in fitting if s.meaning.side == side] or [s for s in fitting if not s.meaning.side] or fitting
-    # In a bag, or of several files, use the stamps of the signal's own topic; prefer the header's stamp.
-    if group := _group(of.sources[0]):
-        chosen = [s for s in fitting if _group(s.sources[0]) == group] or chosen
-    chosen = (
-        [s for s in chosen if s.name.endswith("header.stamp")]
-        or [s for s in chosen if s.name.endswith("stamp")]
-        or chosen
-    )
+    # Prefer the stamps of the signal's own topic or file, then those of its side; in a topic, the header's.
+    group, side = _group(of.sources[0]), of.meaning.side or ("command" if node == "actuator" else "measured")
+    chosen = [s for s in fitting if group and _group(s.sources[0]) == group]
+    chosen = chosen or [s for s in fitting if s.meaning.side == side] or [s for s in fitting if not s.meaning.side]
+    chosen = chosen or fitting
+    header = [s for s in chosen if s.name.endswith("header.stamp")] or [s for s in chosen if s.name.endswith("stamp")]
+    log = [s for s in chosen if s.name.endswith(".log_time")]
+    apart_s = _apart_s(header[0].values[:, 0], log[0].values[:, 0]) if header and log else 0.0
+    if apart_s > _APART_S:
+        draft.questions[node, "", "stamps"] = (
+            f'"{header[0].name}" or "{log[0].name}"?  # the sender\'s clock and the recorder\'s drift apart by '
+            f"{apart_s:.2g} s: one of them steps, or runs at another rate"
+        )
+    chosen = header or chosen
     if not chosen:
-        for key, unit in (("rate", 1.0), ("period", None)):
-            for s in signals:
-                if s.values.shape == (1,) and s.values[0] > 0 and s.meaning.quantity == key:
-                    rate_hz = (
-                        float(s.values[0]) if unit else 1.0 / float(s.values[0] * (1.0 if s.values[0] < 1.0 else 1e-3))
-                    )
-                    draft.reasons[node, "", "rate_hz"] = f"{s.name!r} in the file"
-                    return {"rate_hz": rate_hz}, np.arange(count) / rate_hz
-        why = f"the stamps {named[0].name!r} repeat or step back" if named else "the file has no time stamps"
-        draft.questions[node, "", "rate_hz"] = f"?  # samples per second: {why}; --rate-hz answers, too"
-        return generated
-    stamps = chosen[0]
+        return _generated(signals, named, count, node, draft)
     if len(chosen) > 1:
         listed = " or ".join(f'"{s.name}"' for s in chosen)
         draft.questions[node, "", "stamps"] = (
             f"{listed}?  # which clock has stamped the {'commands' if side == 'command' else 'positions'}"
         )
+    stamps = chosen[0]
     unit, reason = _stamp_unit(stamps)
     if unit is None:
-        draft.questions[node, "", "stamp_unit"] = (
-            f"{reason}?  # the stamps are {_period(stamps.values[:, 0]):.6g} apart"
-        )
-        unit = "s"
-    draft.reasons[node, "", "stamps"] = (
-        f"by its name; {reason}" if unit != "s" or stamps.meaning.unit else "by its name, in s"
-    )
-    keys: dict[str, Any] = {"stamps": stamps.sources[0], "stamp_unit": unit}
-    return keys, stamps.values[:, 0] * STAMP_UNITS[unit] * 1e-9
+        apart = f"the stamps are {_period(stamps.values[:, 0]):.6g} apart"
+        draft.questions[node, "", "stamp_unit"] = f"{reason}?  # {apart}"
+    draft.reasons[node, "", "stamps"] = f"by its name; {reason}"
+    keys: dict[str, Any] = {"stamps": stamps.sources[0], "stamp_unit": unit or "s"}
+    return keys, stamps.values[:, 0] * STAMP_UNITS[unit or "s"] * 1e-9
+
+
+def _generated(
+    signals: Sequence[Signal], named: Sequence[Signal], count: int, node: str, draft: Proposal
+) -> tuple[dict[str, Any], np.ndarray]:
+    """Return the keys and stamps of a node without a clock: by a rate in the file, or a question."""
+    for s in signals:
+        if s.values.shape == (1,) and s.values[0] > 0 and s.meaning.quantity in ("rate", "period"):
+            value = float(s.values[0])
+            rate_hz = value if s.meaning.quantity == "rate" else 1.0 / (value * (1.0 if value < 1.0 else 1e-3))
+            draft.reasons[node, "", "rate_hz"] = f"{s.name!r} in the file"
+            return {"rate_hz": rate_hz}, np.arange(count) / rate_hz
+    why = f"the stamps {named[0].name!r} repeat or step back" if named else "the file has no time stamps"
+    draft.questions[node, "", "rate_hz"] = f"?  # samples per second: {why}; --rate-hz answers, too"
+    return {"rate_hz": 1.0}, np.arange(float(count))
 
 
 def _stamp_unit(stamps: Signal) -> tuple[str | None, str]:
     """Return the unit of stamps and the reason; None and the candidates."""
-    values = stamps.values[np.isfinite(stamps.values[:, 0]), 0]
     if stamps.meaning.unit in STAMP_UNITS:
         return stamps.meaning.unit, "unit by its name"
+    values = stamps.values[np.isfinite(stamps.values[:, 0]), 0]
     seconds = {unit: nanoseconds * 1e-9 for unit, nanoseconds in STAMP_UNITS.items()}
     period = _period(values)
     wall = [u for u, s in seconds.items() if _WALL_S[0] < values[0] * s < _WALL_S[1]]
@@ -269,6 +279,21 @@ def _stamp_unit(stamps: Signal) -> tuple[str | None, str]:
     return None, " or ".join(f'"{u}"' for u in likely or seconds)
 
 
+def _apart_s(header: np.ndarray, log: np.ndarray) -> float:
+    """Return by how much two clocks [ns] drift apart, without the few messages that came late."""
+    apart = 1e-9 * (header - log)
+    return max(float(np.ptp(np.quantile(apart, (0.05, 0.95)))), abs(float(apart[-1] - apart[0])))
+
+
+def require_overlap(clocks: Mapping[str, np.ndarray], draft: Proposal) -> None:
+    """Ask for the offset of two clocks if the streams hardly overlap."""
+    t, c = (np.asarray(clocks[n])[np.isfinite(clocks[n])] for n in ("sensor", "actuator"))
+    if len(t) and len(c) and min(t[-1], c[-1]) - max(t[0], c[0]) < 0.5 * min(np.ptp(t), np.ptp(c)):
+        draft.questions["actuator", "", "stamp_offset"] = (
+            f"{t[0] - c[0]:.6g}?  # stamps of commands and positions hardly overlap: seconds to add to commands"
+        )
+
+
 def _period(values: np.ndarray) -> float:
     steps = np.diff(values[np.isfinite(values)])
     return float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
@@ -277,47 +302,3 @@ def _period(values: np.ndarray) -> float:
 def _increases(values: np.ndarray) -> bool:
     steps = np.diff(values[np.isfinite(values)])
     return steps.size > 1 and float((steps > 0).mean()) > 0.9 and not (steps < 0).any()
-
-
-def _group(key: str) -> str:
-    """Return the topic of a signal in a bag, or the file of one of several; empty for others."""
-    return key.partition(".")[0] if key.startswith("/") else key.partition("/")[0] if "/" in key else ""
-
-
-def require_one_clock(
-    table: Table, nodes: Mapping[str, dict[str, Any]], clocks: dict[str, np.ndarray], draft: Proposal
-) -> None:
-    """Take a bag's own clock where the headers of a sender disagree with it, and ask if streams do not overlap."""
-    for node, keys in nodes.items():
-        source = str(keys.get("stamps", ""))
-        other = f"{_group(source)}.log_time"
-        if not source.startswith("/") or source == other or other not in table.columns:
-            continue
-        own, log = clocks[node], table.columns[other] * 1e-9
-        if len(own) < 10 or (np.diff(log) < 0).any():
-            continue
-        # A clock that drifts is slow throughout; one that was set has the one odd step.
-        apart = own - log - (own[0] - log[0])
-        rate = float(np.polyfit(log - log[0], apart, 1)[0])
-        drift, odd = abs(rate) * np.ptp(log), [float(np.abs(np.diff(x) - _period(x)).max()) for x in (own, log)]
-        steady = np.abs(apart - np.polyval(np.polyfit(log - log[0], apart, 1), log - log[0])).max() < 0.2 * drift
-        limit = max(0.01, 2 * _period(log))
-        if drift > limit and steady:
-            what = f"runs {100 * abs(rate):.3g} % {'slow' if rate < 0 else 'fast'}, {drift:.2g} s in all"
-        elif np.ptp(apart) > 10 * limit and odd[0] > 2 * odd[1]:
-            what = f"steps by {odd[0]:.3g} s"
-        else:
-            continue
-        for name in nodes:
-            replaced = f"{_group(str(nodes[name].get('stamps', '')))}.log_time"
-            if replaced in table.columns:
-                nodes[name].update(stamps=replaced, stamp_unit="ns")
-                clocks[name] = table.columns[replaced] * 1e-9
-                draft.reasons[name, "", "stamps"] = "the recorder's clock"
-        draft.evidence.append(f"{source} {what} against the recorder's clock, which replaces the stamps of all streams")
-        break
-    t, c = (np.asarray(clocks[n])[np.isfinite(clocks[n])] for n in ("sensor", "actuator"))
-    if len(t) and len(c) and min(t[-1], c[-1]) - max(t[0], c[0]) < 0.5 * min(np.ptp(t), np.ptp(c)):
-        draft.questions["actuator", "", "stamp_offset"] = (
-            f"{t[0] - c[0]:.6g}?  # stamps of commands and positions hardly overlap: seconds to add to commands"
-        )

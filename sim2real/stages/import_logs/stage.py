@@ -6,15 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from sim2real.artifacts import run as run_folder
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
-from sim2real.log.importing import importer
+from sim2real.log.importing import checks, importer
 from sim2real.log.importing.mapping import MAPPING, ImportMapping, load_mapping
-from sim2real.log.importing.propose import check_mapping, hint_for, propose
+from sim2real.log.importing.propose import propose
 from sim2real.log.importing.readers import Table, joined, open_tables
 from sim2real.log.importing.signals import ImportHints, Proposal
 from sim2real.robots.model.drives import joints_of, slides_of
@@ -39,20 +37,21 @@ def run(config: ImportConfig) -> None:
         sets = [[joined([table for tables in sets for table in tables])]]
     if config.out is not None and len(sets[0]) > 1:
         raise UsageError(f"out names one log, but there are {len(sets[0])} episodes", hint="choose one with --episode")
-    mapping = configured_mapping(config)
+    mapping, joints = configured_mapping(config), config.joints
     text = "" if mapping else None
     for tables in sets:
         # Read the file by the mapping; propose a mapping for the first file if there is none.
         if mapping is None:
-            mapping, text = proposed(tables[0], hints_of(config), config.out)
-            checked = 1
+            hints = hints_of(config)
+            mapping, text = proposed(tables[0], hints, config.out)
+            joints, checked = hints.joints, 1
         else:
             checked = 0
             for line in tables[0].notes:
                 note(line)
         episodes = [importer.import_table(table, mapping, config.selection) for table in tables]
         for table, episode in list(zip(tables, episodes, strict=True))[checked:]:
-            refuse_contradictions(table.path, episode, config.as_told)
+            refuse_contradictions(table.path, episode, config.as_told, joints)
 
         # Write the logs, with the proposed mapping beside them.
         written = None
@@ -123,8 +122,7 @@ def hints_of_model(
     if unknown := [j for j in joints if j not in every]:
         raise UsageError(f"{mjcf} has no joint {unknown[0]!r}. Available: {', '.join(every)}")
     chosen = joints or every
-    ranges = np.array([model.joint(j).range for j in chosen])
-    return ImportHints(name, rate_hz, chosen, ranges, slides=slides_of(model, chosen), **more)
+    return ImportHints(name, rate_hz, chosen, slides=slides_of(model, chosen), **more)
 
 
 def pipeline_name(path: Path) -> str:
@@ -197,12 +195,12 @@ def refuse_contradictions(path: Path, episode: Episode, as_told: bool, joints: S
     Raises:
         UsageError: When joints follow other commands than their own, or move against them.
     """
-    findings = [f for f in check_mapping(episode, joints) if f.weight != "note"]
+    findings = [f for f in checks.check_episode(episode, joints) if f.weight != "note"]
     wrong = [f for f in findings if f.weight == "refuse"]
     if wrong and not as_told:
         raise UsageError(
             f"the mapping and the data of {path} contradict each other: {'; '.join(f.text for f in wrong)}",
-            hint=hint_for(wrong),
+            hint=checks.hint_for(wrong),
         )
     for f in findings:
         note(f"warning: {f.text}")
