@@ -365,7 +365,7 @@ def _draw_link(axes: Axes, link: Link) -> None:
 
 def _expected(result: Identification) -> list[Block]:
     """Return the expected errors, and the errors on held-out data beside them, the largest ratios first."""
-    items = [sentence(str(e), [h.name for h in result.held_out]) for e in result.expected_error]
+    items = [f"{e.name}, {e.how}: {number(e.error, 3)} {pretty_unit(e.unit)}".strip() for e in result.expected_error]
     lead = ListBlock("The errors to expect on later data, for motion like the fitted one", items)
     blocks: list[Block] = [lead] if items else []
     table = TableBlock.of("Errors on held-out data beside the expected errors", result.compared_table())

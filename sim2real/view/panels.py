@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 
 from sim2real.log.schema import unit_of
 from sim2real.view import style
-from sim2real.view.style import GRID, MUTED, ROLES, SHADE, new_figure, styled, to_svg
+from sim2real.view.style import GRID, MUTED, ROLES, SHADE, new_figure, new_grid, styled, to_svg
 
 
 @dataclass(frozen=True)
@@ -59,15 +59,17 @@ def over_time(panels: Sequence[Panel], name: str, label: str, shade: str = "held
     zooms = {panel.zoom for panel in panels}
     beside = [panel.difference for panel in panels if panel.difference is not None]
     closer = zooms != {None} or bool(beside)
-    titled = sum(bool(panel.title) for panel in panels)
+    titled = any(panel.title for panel in panels)
     with styled():
-        figure = new_figure(0.7 + 1.45 * len(panels) + 0.22 * titled)
-        grid = figure.subplots(
+        alone = len(zooms) > 1 or titled
+        figure, grid = new_grid(
             len(panels),
             1 + closer,
-            sharex="col" if len(zooms) == 1 and not titled else "none",
+            row_in=1.3,
+            gap_in=0.25 + 0.25 * alone,
+            beside_in=0.7,
+            sharex="none" if alone else "col",
             sharey="none" if beside else "row",
-            squeeze=False,
             width_ratios=[2.1, 1][: 1 + closer],
         )
         # Draw each panel, and its enlarged part beside it.

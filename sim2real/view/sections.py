@@ -16,7 +16,7 @@ from sim2real.artifacts.iterations import iterations, iterations_table
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run import StageFolder, finished
 from sim2real.artifacts.sensitivity import SENSITIVITY, Sensitivity
-from sim2real.artifacts.summary import words_and_unit
+from sim2real.artifacts.summary import ArtifactTable, words_and_unit
 from sim2real.graph.episode import Episode
 from sim2real.log.schema import unit_of
 from sim2real.types import Json
@@ -38,7 +38,6 @@ from sim2real.view.blocks import (
     sentence,
 )
 from sim2real.view.delay_parts import delay_blocks
-from sim2real.view.episodes import episodes_svg
 from sim2real.view.identification import identify_section
 from sim2real.view.panels import Line, Panel, compared, over_time, with_unit
 from sim2real.view.signals import ComparedSeries, Signals, is_dry, pairs_of, signals_of, simulated_beside
@@ -119,7 +118,8 @@ def recording_svg(log: Signals, name: str) -> str:
 def servo_blocks(episodes: Sequence[Episode]) -> list[Block]:
     """Return sentences and table on the servos of one session; empty for a log without servos."""
     ends: list[Mapping[str, Json]] = [e.metadata.get("log", {}).get("session_end") or {} for e in episodes]
-    items = list(_answers(ends[-1]))  # the count of answers covers all episodes of a session
+    # The count of answers covers all episodes of a session.
+    items = list(_answers(ends[-1], episodes[-1].metadata.get("port") == "embedded"))
     blocks: list[Block] = [ListBlock("Servos and their measurements", items)] if items else []
     rows = []
     for i, end in enumerate(ends):
@@ -133,14 +133,15 @@ def servo_blocks(episodes: Sequence[Episode]) -> list[Block]:
     return blocks
 
 
-def _answers(end: Mapping[str, Json]) -> Iterator[str]:
+def _answers(end: Mapping[str, Json], embedded: bool) -> Iterator[str]:
     """Yield sentences on the number of answers, and on late answers."""
     if "late_replies" not in end or not end.get("transactions"):
         return
     count, late = int(end["transactions"]), int(end["late_replies"])
     yield f"{number(count)} answers came; {number(end.get('lost_replies', 0))} were lost, and requested again."
     count_late = f"{number(late)} answers ({late / count:.1%})" if late else "No answer"
-    advice = ": set the adapter's latency timer to 1 ms, and close other programs" if late > _MAX_LATE * count else ""
+    advice = "" if embedded else ", and set the latency timer of a USB adapter to 1 ms"
+    advice = f": close what else runs on this computer{advice}" if late > _MAX_LATE * count else ""
     yield f"{count_late} came so late that the sample's time is uncertain{advice}."
     if all(isinstance(q, int | float) for q in end.get("late_s") or [None]):
         half, most, last = (fixed(1e3 * q, 2) for q in end["late_s"])
@@ -224,11 +225,9 @@ def _episode_blocks(artifact: StageFolder) -> list[Block]:
     drawn = Episodes.load(artifact.folder)
     if not drawn.parameters and not drawn.drawn_s:
         return [NoteBlock("All episodes had the same parameters, without delays.")]
-    caption = (
-        "Distributions of the episodes: parameters with the 95 % interval of the estimate, computation times with "
-        "those of the recording, noise with the differences between measurements and model. The posterior's deviations "
-        f"are multiplied by {drawn.widening:.1f}, to cover errors of the model."
-    )
+    caption = "Each episode draws its own parameters, computation times and noise."
+    if drawn.widening > 1.0:
+        caption += f" The posterior's deviations are multiplied by {drawn.widening:.1f}, to cover errors of the model."
     # Describe pauses, pushes and the curriculum if there are any.
     if drawn.cut or drawn.again:
         caption += (
@@ -241,10 +240,21 @@ def _episode_blocks(artifact: StageFolder) -> list[Block]:
         first, last = drawn.curriculum
         follow = f" while success is above {drawn.follow:g}" if drawn.follow else ""
         caption += (
-            f" The share of all differences grows from {first:g} to {last:g} in training{follow}; the plots show "
+            f" The share of all differences grows from {first:g} to {last:g} in training{follow}; the tables show "
             f"{last:g}."
         )
-    return [FigureBlock(episodes_svg(drawn, "train-episodes"), caption)]
+    times = [
+        [node, kind, *np.nanquantile(1e3 * values[node], (0.5, 0.99, 1.0)).tolist()]
+        for node in drawn.recorded_s
+        for kind, values in (("recorded", drawn.recorded_s), ("drawn", drawn.drawn_s))
+        if node in drawn.drawn_s and np.isfinite(values[node]).any()
+    ]
+    tables = {
+        "Parameters of the episodes": drawn.rows(),
+        "Computation of a step [ms]": ArtifactTable(("node", "", "p50", "p99", "max"), times),
+        "Noise of a reading": drawn.noise_table(),
+    }
+    return [NoteBlock(caption), *(TableBlock.of(name, table) for name, table in tables.items() if table.rows)]
 
 
 def sensitivity_blocks(folder: Path) -> list[Block]:

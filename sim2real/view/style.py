@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias, cast
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -113,6 +114,35 @@ def new_figure(height_in: float, width_in: float = WIDTH_IN) -> Figure:
     figure = Figure(figsize=(width_in, height_in), layout="constrained")
     FigureCanvasSVG(figure)
     return figure
+
+
+def new_grid(
+    rows: int, columns: int, row_in: float, gap_in: float, beside_in: float, width_in: float = WIDTH_IN, **more: Any
+) -> tuple[Figure, np.ndarray]:
+    """Return a figure with many axes of one height, and the axes ``(rows, columns)``.
+
+    Its margins are fixed: automatic layout measures each label, which takes as long as the drawing.
+
+    Args:
+        row_in: Height of the axes [in].
+        gap_in: Space between rows, with the labels of an axis [in].
+        beside_in: Space left of each column, with its labels [in].
+        more: For ``Figure.subplots``.
+    """
+    above_in, below_in, right_in = 0.5, 0.42, 0.12
+    height_in = above_in + rows * row_in + (rows - 1) * gap_in + below_in
+    figure = Figure(figsize=(width_in, height_in))
+    FigureCanvasSVG(figure)
+    axes_in = (width_in - columns * beside_in - right_in) / columns
+    margins = {
+        "left": beside_in / width_in,
+        "right": 1 - right_in / width_in,
+        "bottom": below_in / height_in,
+        "top": 1 - above_in / height_in,
+        "hspace": gap_in / row_in,
+        "wspace": beside_in / axes_in,
+    }
+    return figure, figure.subplots(rows, columns, squeeze=False, gridspec_kw=margins, **more)
 
 
 def render(figure: Figure) -> str:

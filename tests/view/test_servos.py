@@ -5,8 +5,8 @@ from types import SimpleNamespace
 from sim2real.view.sections import servo_blocks
 
 
-def episode(end, dry=False):
-    return SimpleNamespace(metadata={"dry_run": dry, "log": {"session_end": end}})
+def episode(end, dry=False, port="/dev/ttyUSB0"):
+    return SimpleNamespace(metadata={"dry_run": dry, "port": port, "log": {"session_end": end}})
 
 
 def test_a_log_that_tells_nothing_of_servos_has_no_block():
@@ -20,3 +20,10 @@ def test_what_was_sent_is_a_table_and_of_a_dry_run_what_would_have_been():
     (table,) = servo_blocks([episode({"sent": [row]}, dry=True)] * 2)
     assert table.caption == "Commands to the motors, which were not sent"
     assert table.rows[1] == ["episode 1: tilt", "rad", "50", "\N{MINUS SIGN}0.5000", "0.1000", "1.000"]
+
+
+def test_late_answers_of_an_emulated_robot_are_not_those_of_an_adapter():
+    late = {"transactions": 100, "late_replies": 30, "late_s": [0.0, 0.01, 0.02]}
+    advised = {port: str(servo_blocks([episode(late, port=port)])[0]) for port in ("/dev/ttyUSB0", "embedded")}
+    assert ["latency timer" in text for text in advised.values()] == [True, False]
+    assert all("close what else runs" in text for text in advised.values())

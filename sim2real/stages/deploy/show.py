@@ -9,11 +9,11 @@ from sim2real.stages.terminal.console import artifact_table, note, table
 from sim2real.types import Json
 
 
-def show_sessions(summaries: Sequence[Mapping[str, Json]], dry_run: bool) -> None:
+def show_sessions(summaries: Sequence[Mapping[str, Json]], dry_run: bool, embedded: bool) -> None:
     """Print the timing of the last session and the warnings of all; of a dry run the withheld commands, too."""
     print(table(*timing_rows(summaries[-1])))
     for summary in summaries:
-        warn(summary)
+        warn(summary, embedded)
     if dry_run:
         show_withheld(summaries)
         note("dry run: the robot did not move, so there is no gap report")

@@ -112,7 +112,7 @@ def run(robot: RecordedRobot, config: DeployConfig, root: Path, run_dir: Path | 
         identification = _identification(robot, stage.run_dir)
         deployment = _deployed(robot, bundle, stage.folder, config, identification)
         summaries = deployment.summary
-        show_sessions(summaries, config.dry_run)
+        show_sessions(summaries, config.dry_run, config.port == "embedded")
 
         # Write the results, then the page about them.
         for name, file in deployment.save(stage.folder).items():

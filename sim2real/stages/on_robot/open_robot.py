@@ -96,13 +96,14 @@ def answer_rows(summary: Mapping[str, Any]) -> list[list[Any]]:
     return [["answers", summary["transactions"], *nothing, *late, *nothing, summary["late_replies"]]]
 
 
-def warn(summary: Mapping[str, Any]) -> None:
+def warn(summary: Mapping[str, Any], embedded: bool) -> None:
     """Print the warnings of a session that did not stop it."""
     share = summary["late_replies"] / max(1, summary["transactions"])
     if share > LATE_SHARE:
         note(
             f"warning: {share:.1%} of the answers came late: when those samples were taken is not sure\n"
-            "hint: set the adapter's latency timer to 1 ms, and close what else runs on this machine"
+            "hint: close what else runs on this computer"
+            + ("" if embedded else ", and set the latency timer of a USB adapter to 1 ms")
         )
 
 

@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from sim2real.stages.check.stage import Checked
 
 
-def show(summary: Mapping[str, Json], dry_run: bool) -> None:
+def show(summary: Mapping[str, Json], dry_run: bool, embedded: bool) -> None:
     """Print the timing table and the warnings of a session; after a dry run the commands that stayed unsent too."""
     print(table(*timing_rows(summary)))
-    warn(summary)
+    warn(summary, embedded)
     if dry_run:
         show_withheld([summary])
 

@@ -88,7 +88,7 @@ def run(robot: RecordedRobot, config: RecordConfig, root: Path, run_dir: Path | 
         summary = recording.summary
         for name, path in recording.timing.save(stage.folder).items():
             stage.output(name, path)
-        show(summary, config.dry_run)
+        show(summary, config.dry_run, config.port == "embedded")
         if config.by_hand:
             show_by_hand(recording, robot)
         stage.summary(

@@ -171,9 +171,6 @@ def _explain(
         episodes = prepare(robot, config, identification).episodes
         for name, file in episodes.save(stage.folder).items():
             stage.output(name, file)
-        from sim2real.view.episodes import picture  # matplotlib takes 0.5 s to import
-
-        picture(stage.output("picture", "episodes.png"), episodes)
         show_episodes(episodes)
         stage.summary(episode_summary(episodes))
     return stage.result
