@@ -87,6 +87,22 @@ def test_a_zero_that_steps_is_named_with_its_time(side, size):
     assert "9.0" in found.text
 
 
+@pytest.mark.parametrize("size", [0.05, 0.3])
+@pytest.mark.parametrize("seconds", [(4.0, 9.0, 15.0), (4.0, 15.0)])
+def test_a_zero_that_steps_several_times_is_named_with_each(size, seconds):
+    q = Q + size * np.sum([at <= T for at in seconds], axis=0)[:, None] * np.array([0, 1, 0])
+    (found,) = [f for f in checks.check((T, T), GOAL, q, NAMES) if f.kind == "zero"]
+    assert (found.joint, all(f"{at:.2f} s" in found.text for at in seconds)) == (1, True)
+
+
+@pytest.mark.parametrize("size", [0.06, 0.5, 6.28])
+def test_a_slip_and_a_turn_of_the_goals_are_said_also_where_nothing_follows(size):
+    slip = size * np.clip((T - 8.0) / 4.0, 0, 1)[:, None] * np.array([0, 1, 0])
+    turn = size * (T >= 9.0)[:, None] * np.array([0, 1, 0])
+    for goal, q in ((GOAL, Q + slip), (GOAL + turn, Q)):
+        assert [f.joint for f in checks.check((T, T), goal, q, NAMES) if f.kind == "zero"] == [1]
+
+
 def test_an_offset_at_rest_is_said():
     assert findings(q=Q + np.array([0, 0, 0.12])) == [("zero", 2, "warn")]
 

@@ -11,7 +11,9 @@ from sim2real.errors import UsageError
 from sim2real.log import load_mapping, read_log
 from sim2real.log.importing.importer import import_table
 from sim2real.log.importing.names import columns_of, is_unit, meaning
-from sim2real.log.importing.readers import open_tables
+from sim2real.log.importing.propose import propose
+from sim2real.log.importing.readers import joined, open_tables
+from sim2real.log.importing.signals import ImportHints
 
 T, GOAL, Q = motion(10.0)
 
@@ -135,6 +137,7 @@ def test_a_vendors_names_are_matched_by_leg_and_number(tmp_path):
         (("FR1", "FR2", "FL1", "FL2"), ("FL_hip", "FL_thigh", "FR_hip", "FR_thigh"), [2, 3, 0, 1]),
         (("front_left_knee", "front_left_hip"), ("FL_hip_joint", "FL_calf_joint"), [1, 0]),
         (("b", "a"), ("a_joint", "b_joint"), [1, 0]),
+        (("hip_FR", "hip_FL", "calf_FR", "calf_FL"), ("FL_hip", "FL_calf", "FR_hip", "FR_calf"), [1, 3, 0, 2]),
         (("FR_0", "FL_0", "RR_0"), ("FL_hip", "FL_thigh", "FL_calf"), None),
         (("x", "y"), ("a", "b"), None),
         (("FR_0", "FR_2"), ("FR_hip", "FR_thigh"), None),
@@ -204,6 +207,20 @@ def test_gains_torque_switches_and_velocities_go_along(tmp_path):
     assert set(found.mapping.nodes["actuator"].fields) == {"goal", "kp", "enabled"}
     assert found.mapping.nodes["sensor"].fields["velocity"].unit == "rad/s"
     assert any("'kd'" in line for line in found.evidence)
+
+
+def test_names_of_files_of_one_recording_are_no_joints(tmp_path):
+    sent = csv(tmp_path / "run1.csv", {"t_s": T, "goal_a_rad": GOAL[:, 0], "goal_b_rad": GOAL[:, 1]})
+    read = csv(tmp_path / "q2.csv", {"t_s": T, "q_a_rad": Q[:, 0], "q_b_rad": Q[:, 1]})
+    found = propose(joined([open_tables(path)[0] for path in (sent, read)]), ImportHints("x"))
+    assert (found.joints, found.questions) == (("a", "b"), {})
+    # Two files of like messages: which one has the commands is asked; a counter is no candidate.
+    for path, values in ((sent, GOAL), (read, Q)):
+        rows = {"%time": T * 1e9, "field.header.seq": np.arange(len(T)), "field.position0": values[:, 0]}
+        csv(path, rows)
+    found = propose(joined([open_tables(path)[0] for path in (sent, read)]), ImportHints("x"))
+    assert {("sensor", "position", "source"), ("actuator", "goal", "source")} <= set(found.questions)
+    assert not any("seq" in text for text in found.questions.values())
 
 
 def test_which_of_two_commands_is_asked(tmp_path):

@@ -30,6 +30,8 @@ _SLOPES = (0.5, 1.6)
 """A servo follows its goal with such a slope; another one means another unit or scale."""
 _STILL = 2e-3
 """A joint with a smaller standard deviation does not move [rad or m]."""
+_MOST_STEPS = 4
+"""A zero that moves more often is no zero."""
 _FASTEST_RAD_S = 60.0
 """Highest speed of a joint; a faster step is no motion."""
 
@@ -174,15 +176,15 @@ def check(
     if any(f.weight == "refuse" for f in clock):
         findings = [f for f in findings if f.kind not in ("follows", "lag")]
     elif moving.size and not lags and not any(f.weight in ("refuse", "ask") for f in findings):
-        text = "no position follows its goal: units, signs and order are unproven"
+        text = "no position follows its goal: units, signs, order and clocks are unproven"
         findings.append(Finding("follows", -1, text, "ask"))
     findings += clock
     if following:
         late = ", ".join(f"{names[i]} {1e3 * lags[i]:.0f} ms" for i in following[:6])
         text = f"positions follow their goals: {late}" + " ..." * (len(following) > 6)
         findings.append(Finding("follows", -1, text, "note"))
-        for i in following:
-            findings += _zero(t_s, goal[:, i], position[:, i], i, names[i], lags[i])
+    for i in moving.tolist() if not any(f.weight == "refuse" for f in findings) else ():
+        findings += _zero(t_s, goal[:, i], position[:, i], i, names[i], lags.get(i)) if not copies[i] else []
     if moving.size:
         findings += _rates(t_s, goal, position, moving.tolist())
     return findings + _scales(position, names)
@@ -355,43 +357,62 @@ def _clock(
 
 
 def _zero(
-    t_s: tuple[np.ndarray, np.ndarray], goal: np.ndarray, position: np.ndarray, i: int, name: str, lag_s: float
+    t_s: tuple[np.ndarray, np.ndarray], goal: np.ndarray, position: np.ndarray, i: int, name: str, lag_s: float | None
 ) -> list[Finding]:
-    """Return findings on a zero that steps, or an offset between goal and position."""
+    """Return findings on a zero that steps, or an offset between goal and position.
+
+    Args:
+        lag_s: By how much the position follows its goal [s]; None if it does not: then only steps are looked for.
+    """
     grid, held, joined, _ = _on_grid(t_s, goal[:, None], position[:, None], None)
     n, period_s = len(grid), float(grid[1] - grid[0])
     # Predict the position from the last goals; the rest shows the zero.
-    span = max(1, round((lag_s + 0.3) / period_s / 12))
+    span = max(1, round(((lag_s or 0.2) + 0.3) / period_s / 12))
     if n - 12 * span < 200:
         return []
-    taps = np.stack([held[12 * span - k * span : n - k * span, 0] for k in range(13)], axis=1)
-    q, at = joined[12 * span :, 0], grid[12 * span :]
-    taps, centred = taps - taps.mean(axis=0), q - q.mean()
-    gram = taps.T @ taps
-    gram += 1e-9 * (np.trace(gram) / len(gram) + 1e-12) * np.eye(len(gram))
+    past = np.stack([held[12 * span - k * span : n - k * span, 0] for k in range(13)], axis=1)
+    q, at, rows = joined[12 * span :, 0], grid[12 * span :], np.arange(n - 12 * span)
 
-    def rest_of(values: np.ndarray) -> np.ndarray:
-        """Return what the goals do not explain of values without a mean."""
-        return values - taps @ np.linalg.solve(gram, taps.T @ values)
+    def fitted(steps: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+        """Return the sizes of the steps, and what goals and steps leave of the positions."""
+        known = np.concatenate([past, rows[:, None] >= np.asarray(steps, int)[None, :]], axis=1)
+        known = known - known.mean(axis=0)
+        gram = known.T @ known
+        gram += 1e-9 * (np.trace(gram) / len(gram) + 1e-12) * np.eye(len(gram))
+        weights = np.linalg.solve(gram, known.T @ (q - q.mean()))
+        return weights[13:], q - q.mean() - known @ weights
 
-    rest = rest_of(centred)
-    # A change of the rest that lasts to the end: a slip, or a zero of the goals that moves.
-    total, count = np.cumsum(rest), np.arange(1, len(rest) + 1)
-    inside = slice(len(rest) // 20, -max(len(rest) // 20, 1))
-    k = int(np.argmax(np.abs(total[inside]) / np.sqrt(count * (len(rest) - count) + 1.0)[inside])) + inside.start + 1
-    fits = []
-    for m in range(max(k - 3, 1), min(k + 4, len(q) - 1)):
-        step = (np.arange(len(q)) >= m).astype(float)
-        step = rest_of(step - step.mean())
-        size = float(step @ rest) / max(float(step @ step), 1e-12)
-        fits.append((float((rest - size * step).std()), m, size, rest - size * step))
-    std, k, size, left = min(fits, key=lambda fit: fit[0])
-    blocks = np.array([b.mean() for b in np.array_split(left, max(8, int(np.ptp(at) / 1.0)))])
-    if abs(size) > 0.03 and abs(size) > 5.0 * blocks.std() and std < 0.8 * rest.std():
-        leaps = abs(size) > 0.1 and 0.6 < (q[k] - q[k - 1]) / size < 1.6
-        since = f"{at[k] - t_s[1][0]:.2f} s on: one of them has another zero"
-        text = f"{name} reads {size:+.3f} rad against its goal from {since}"
+    # Add the step that explains most of the rest, up to a few: slips, or zeros that move.
+    steps: list[int] = []
+    _, rest = fitted(steps)
+    first, edge = float(rest.std()), max(len(q) // 20, 1)
+    for _ in range(_MOST_STEPS):
+        total, count = np.cumsum(rest), rows + 1.0
+        far = int(np.argmax((np.abs(total) / np.sqrt(count * (len(q) - count) + 1.0))[edge:-edge])) + edge + 1
+        # A step of the goals can hide what follows them.
+        leapt = int(np.argmax(np.abs(np.diff(past[edge:-edge, 0])))) + edge + 1
+        near = {m for k in (far, leapt) for m in range(max(k - 3, 1), min(k + 4, len(q) - 1))} - {*steps}
+        if not near:
+            break
+        left, k = min((float(fitted([*steps, m])[1].std()), m) for m in near)
+        if left > 0.9 * rest.std():
+            break
+        steps.append(k)
+        _, rest = fitted(steps)
+    # A slip is several small steps, or one.
+    for chosen in (steps, steps[:1]):
+        sizes, rest = fitted(chosen)
+        blocks = np.array([b.mean() for b in np.array_split(rest, max(8, int(np.ptp(at) / 1.0)))])
+        least = max(0.03, 5.0 * float(blocks.std()))
+        moved = sorted((k, float(size)) for k, size in zip(chosen, sizes, strict=True) if abs(size) > least)
+        if not moved or rest.std() > 0.8 * first:
+            continue
+        leaps = any(abs(size) > 0.1 and 0.6 < (q[k] - q[k - 1]) / size < 1.6 for k, size in moved)
+        listed = ", ".join(f"{size:+.3f} rad from {at[k] - t_s[1][0]:.2f} s on" for k, size in moved)
+        text = f"{name} reads against its goal {listed}: one of them has another zero"
         return [Finding("zero", i, text, "refuse" if leaps else "warn")]
+    if lag_s is None:
+        return []
     shift = round(lag_s / period_s)
     error = joined[max(shift, 0) :, 0] - held[: n - max(shift, 0), 0]
     offset = float(np.median(error))

@@ -27,6 +27,7 @@ _QUANTITIES = {
     "rate": "fps rate hz freq frequency",
     "period": "dt period",
     "error": "error errors err",
+    "counter": "seq sequence",
 }
 _UNITS = {
     "rad": "rad rads radian radians",
@@ -194,10 +195,13 @@ def _by_leg(names: Sequence[str]) -> list[tuple[str, int]] | None:
         text = "".join(
             _LEG_WORDS.get(w) or w for w in words if w not in _FILLERS and w not in ("leg", "joint", "motor")
         )
-        match = re.match(r"(fl|fr|rl|rr|lf|rf|lh|rh|hl|hr|lr|lb|rb|bl|br)_?(.+)$", text)
-        if match is None:
+        first, last = (re.fullmatch(form, text) for form in (f"({'|'.join(_LEGS)})(.+)", f"(.+)({'|'.join(_LEGS)})"))
+        if first is not None:
+            leg, part = _LEGS[first[1]], first[2]
+        elif last is not None:
+            leg, part = _LEGS[last[2]], last[1]
+        else:
             return None
-        leg, part = _LEGS[match[1]], match[2].lstrip("_")
         number = int(part) if part.isdigit() else _PART.get(part)
         if number is None:
             return None

@@ -105,6 +105,8 @@ def _choose(
     if len(unlike) == 1:
         return unlike[0]
     choices = unlike or [s for s in series if s.meaning.quantity in ("", "position")]
+    if other is not None:  # the likeliest first
+        choices.sort(key=lambda s: (set(s.labels) != set(other.labels), s.width != other.width))
     if not choices:
         raise UsageError(
             f"{table.path} has no {'measured positions' if side == 'measured' else 'commands'}. "
@@ -179,6 +181,8 @@ def _matched(
     """Return the commands in the order of the joints, and whether names match them."""
     if all(measured.labels) and set(measured.labels) <= set(command.labels):
         return command.taken([command.labels.index(label) for label in measured.labels]), True
+    if ("actuator", "goal", "source") in draft.questions:
+        return command, True
     for joints in (measured.labels, draft.joints):
         if all(joints) and any(command.labels) and (found := columns_of(joints, command.labels)) is not None:
             if found[1] != "by name":

@@ -62,6 +62,7 @@ class Table:
         nominal: Stamps that are computed from a rate.
         robot: Robot type of a LeRobot data set.
         beside: Further files of the same recording.
+        stems: Beginnings of the names of several files' signals: ``STEM/``.
     """
 
     path: Path
@@ -74,6 +75,7 @@ class Table:
     nominal: set[str] = field(default_factory=set)
     robot: str = ""
     beside: tuple[Path, ...] = ()
+    stems: tuple[str, ...] = ()
 
     @property
     def keys(self) -> list[str]:
@@ -463,4 +465,5 @@ def joined(tables: Sequence[Table]) -> Table:
         whole.nominal |= {f"{table.path.stem}/{name}" for name in table.nominal}
         whole.notes += table.notes
     whole.beside = tuple(path for t in tables for path in (t.path, *t.beside))[1:]
+    whole.stems = tuple(f"{t.path.stem}/" for t in tables)
     return whole

@@ -132,13 +132,13 @@ def collect(table: Table) -> tuple[list[Signal], list[str]]:
     notes: list[str] = []
     lists = {key: words for key, words in table.words.items() if _names_joints(key, words)}
     for key, why in table.broken.items():
-        named = meaning(key)
+        named = _meaning(key, table)
         # Without such a column, another one could be taken for the positions.
         if named.quantity == "position" or (named.side and not named.quantity):
             raise UsageError(f"{key!r} in {table.path} cannot be read: {why}", hint="correct it, or remove the column")
         notes.append(f"skipped: {key!r}: {why}")
     for key, raw in table.columns.items():
-        named, values = meaning(key), raw.astype(np.float64)
+        named, values = _meaning(key, table), raw.astype(np.float64)
         if values.size and values.ndim <= 2 and not np.isfinite(values).any():
             notes.append(f"skipped: {key!r} has no number in any sample")
         elif values.ndim <= 1:
@@ -155,7 +155,7 @@ def collect(table: Table) -> tuple[list[Signal], list[str]]:
     for (named, _, _), rows in single.items():
         labels = [row.labels[0] for row in rows]
         together = len(rows) > 1 and len(set(labels)) == len(labels) and "" not in labels and named.quantity != "stamp"
-        if not together or not (named.side or named.quantity):
+        if not together or not (named.side or named.quantity or are_numbers(labels)):
             signals += rows
             continue
         values = np.concatenate([row.values for row in rows], axis=-1)
@@ -169,6 +169,13 @@ def collect(table: Table) -> tuple[list[Signal], list[str]]:
     if words := [key for key in table.words if key not in lists and len(set(table.words[key])) > 1]:
         notes.append(f"skipped, as they hold no numbers: {', '.join(words[:20])}")
     return signals, notes
+
+
+def _meaning(key: str, table: Table) -> Meaning:
+    """Return the meaning of a signal's name; of a file's name only the side counts."""
+    stem = next((stem for stem in table.stems if key.startswith(stem)), "")
+    named = meaning(key[len(stem) :])
+    return named if named.side or not stem else replace(named, side=meaning(stem).side)
 
 
 def _label_of(key: str, named: Meaning, table: Table) -> str:
