@@ -8,6 +8,7 @@ import lerobot_sets as sets
 from lerobot_sets import NAMES, calibration, data_set, motion, written
 
 from sim2real import cli
+from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run import newest
 from sim2real.errors import UsageError
 from sim2real.log import read_log
@@ -16,6 +17,8 @@ from sim2real.log.importing.lerobot import conversion
 from sim2real.log.importing.propose import propose
 from sim2real.log.importing.readers import open_tables
 from sim2real.log.importing.signals import ImportHints
+from sim2real.stages.load import load_robot
+from sim2real.stages.train.trained_bundle import has_readings
 
 EPISODES = [motion(120, seed) for seed in range(3)]
 
@@ -77,6 +80,9 @@ def test_all_episodes_lead_to_an_so101_in_one_run(tmp_path, monkeypatch, capsys)
         assert episode.metadata["pipeline"] == "so101"
         np.testing.assert_allclose(episode.outputs["sensor"]["position"], q, atol=1e-4)
         np.testing.assert_allclose(episode.outputs["actuator"]["goal"], goal, atol=1e-4)
+    # Training takes no observations from a log without velocities.
+    recording = Recording.load(stage.folder)
+    assert not has_readings(load_robot("so101"), recording)
 
 
 def test_other_parquet_files_are_tables(tmp_path):

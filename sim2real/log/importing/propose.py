@@ -424,7 +424,7 @@ def _check(
         return
     for key in dict.fromkeys(answerable[f.kind] for f in open_ones):
         found = [f for f in open_ones if answerable[f.kind] == key]
-        at = ("actuator", "goal")
+        node, name = ("actuator", "goal")
         if key == "scale":
             scale = np.broadcast_to(goal.scale, (len(draft.joints),)).tolist()
             flipped = [-x if any(f.joint == i for f in found) else x for i, x in enumerate(scale)]
@@ -432,9 +432,10 @@ def _check(
         elif key == "source":
             candidates = f"{json.dumps(goal.sources)} in another order?"
         else:
-            at = inferred[0] if inferred else at
+            node, name = inferred[0] if inferred else (node, name)
             candidates = f'"{goal.unit}" or another?'
-        draft.questions[(*at, key)] = f"{candidates}  # {'; '.join(f.text for f in found)}; --as-told keeps the file's"
+        why = "; ".join(f.text for f in found)
+        draft.questions[node, name, key] = f"{candidates}  # {why}; --as-told keeps the file's"
     for node, name in inferred if not followed else ():
         draft.questions.setdefault(
             (node, name, "unit"),

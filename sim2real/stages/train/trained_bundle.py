@@ -49,7 +49,7 @@ def bundle_of_training(
 
     # Observations: the last ones of the training, and those of a robot's recording.
     observations = {"training": result.observations[:MAX_OBSERVATIONS]}
-    if recording is not None:
+    if recording is not None and has_readings(setup.robot, recording):
         runner = make_runner(weights, contract, None, policy.spec, graph)
         observations["log"] = observations_of(setup.robot, recording, runner)
     references = {name: reference_of(policy, array) for name, array in observations.items()}
@@ -137,6 +137,11 @@ class _Agent(Protocol):
     def act(self, step_state: StepState, action: Array) -> tuple[StepState, PyTree]:
         """Return the new step state and the output."""
         ...
+
+
+def has_readings(robot: Robot, recording: Recording) -> bool:
+    """Return whether a log has all readings of a robot; one of another recorder may lack velocities."""
+    return set(named_leaves(robot.sensor.at_rest)) <= set(recording.episode.outputs.get(SENSOR, {}))
 
 
 def observations_of(robot: Robot, recording: Recording, runner: PolicyRunner) -> np.ndarray:
