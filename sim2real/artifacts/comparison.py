@@ -95,7 +95,7 @@ def _figures_of(run: ComparedRun) -> dict[str, Json]:
     if (identification := run.identification) is not None:
         figures["identification"] = identification.verdict.status
         for row in identification.held_out:
-            figures[f"error {row.horizon_s:g} s ahead, {row.name} [{row.unit}]"] = row.rmse.get("identified")
+            figures[f"error {row.seconds:g} s ahead, {row.name} [{row.unit}]"] = row.error
     if (deployment := run.deployment) is not None:
         if deployment.advice is not None:
             figures["deployment"] = deployment.advice.status

@@ -27,7 +27,7 @@ from sim2real.artifacts.timing import TIMING, Timing
 from sim2real.errors import Sim2RealError
 from sim2real.types import Json
 
-FORMAT = 3
+FORMAT = 4
 PARAMETERS, PREDICTIONS, FREE_RUNS, REPLAYS = "parameters.json", "predictions.npz", "free_runs.npz", "replays.npz"
 ROUND_TRIP = "round_trip_delay"
 """Name of the sum of all delays."""
@@ -114,27 +114,6 @@ class Prediction:
     horizon_s: float
     held_out: bool
     rmse: Mapping[str, float | None]
-
-
-@dataclass(frozen=True)
-class HeldOut:
-    """Errors of one position on held-out data, up to the longest horizon.
-
-    Attributes:
-        column: Its name among the fields, such as ``position[1]``.
-        rmse: Model -> root mean square error; None if it is infinite.
-        beaten_by: Baselines with an error that is not larger.
-    """
-
-    name: str
-    column: str
-    unit: str
-    horizon_s: float
-    rmse: Mapping[str, float | None]
-    beaten_by: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        check("identified" in self.rmse, f"no error of the identified model in {self.name!r}")
 
 
 @dataclass(frozen=True)
@@ -329,7 +308,7 @@ class ComparedError:
     """An error on data that was not fitted, beside the expected one.
 
     Attributes:
-        source: The predicted data: the held-out end of a log, or a log.
+        source: The predicted data: all held-out data, the held-out end of a log, or a log.
         error: Root mean square error; None if the model diverges.
         expected: None if there were too few held-out parts.
         wider: Factor in ``expected`` for a motion that is faster or goes further than the fitted one.
@@ -348,6 +327,11 @@ class ComparedError:
     wider: float = 1.0
     beaten_by: tuple[str, ...] = ()
     baselines: Mapping[str, float | None] = field(default_factory=dict)
+
+    @property
+    def rmse(self) -> dict[str, float | None]:
+        """Model -> its error, ``identified`` first; None if it diverges."""
+        return {"identified": self.error, **self.baselines}
 
     @property
     def ratio(self) -> float | None:
@@ -568,7 +552,7 @@ class Identification(Shown):
     misfit: float | None = None
     check: Determined | None = None
     prediction: tuple[Prediction, ...] = ()
-    held_out: tuple[HeldOut, ...] = ()
+    held_out: tuple[ComparedError, ...] = ()
     worst: WorstSecond | None = None
     free_run: tuple[FreeRun, ...] = ()
     aggregate: tuple[Quantity, ...] = ()
@@ -626,7 +610,7 @@ class Identification(Shown):
             [row.name, *(row.rmse.get(m) for m in models), row.unit, ", ".join(row.beaten_by) or "none"]
             for row in self.held_out
         ]
-        horizon = f"held-out RMSE, {self.held_out[0].horizon_s:g} s ahead" if self.held_out else ""
+        horizon = f"held-out RMSE, {self.held_out[0].seconds:g} s ahead" if self.held_out else ""
         return ArtifactTable((horizon, *models, "unit", "no better than"), rows)
 
     def expected_of(self, column: str, kind: ErrorKind) -> ExpectedError | None:

@@ -163,8 +163,8 @@ def main_figures(done: StageFolder) -> dict[str, Any]:
     figures = {name: summary[name] for name in _FIGURES[done.stage] if name in summary}
     if done.stage == "identify" and (rows := Identification.load(done.output("parameters")).held_out):
         worst, which = rows[0], ", the worst joint" if len(rows) > 1 else ""
-        error = worst.rmse.get("identified")
-        figures[f"error {worst.horizon_s:g} s ahead"] = (
+        error = worst.error
+        figures[f"error {worst.seconds:g} s ahead"] = (
             "diverges" if error is None else f"{error:.2g} {worst.unit} of {worst.name}{which}"
         )
     if done.stage == "deploy":

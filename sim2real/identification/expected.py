@@ -110,7 +110,7 @@ def expected_at(document: Identification, column: str, error_at_horizon: float) 
         error_at_horizon: The error on held-out data at the shorter horizon.
     """
     expected = document.expected_of(column, AHEAD)
-    longest = next((row.rmse["identified"] for row in document.held_out if row.column == column), None)
+    longest = next((row.error for row in document.held_out if row.column == column), None)
     if expected is None or not longest:
         return error_at_horizon
     return error_at_horizon * max(1.0, expected.error / longest)

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from sim2real.artifacts.identification import Determined, HeldOut, Judgement, Prediction
+from sim2real.artifacts.identification import AHEAD, ComparedError, Determined, Judgement, Prediction
 from sim2real.identification.parameters import Parameter, ParameterTable
 from sim2real.identification.predictions import NOISE, Position
 from sim2real.identification.uncertainty import ABSENT, BOUND, NOT_REACHED, OK, Uncertainty
@@ -30,7 +30,7 @@ NO_DELAY = "no delay"
 """The same model fitted without delays. If it is as good, the data needs no delays; that is no failure."""
 
 
-def scores(prediction: Sequence[Prediction], positions: Sequence[Position]) -> list[HeldOut]:
+def scores(prediction: Sequence[Prediction], positions: Sequence[Position]) -> list[ComparedError]:
     """Return the errors of each position on held-out data at the longest horizon, the worst first.
 
     Args:
@@ -51,7 +51,7 @@ def scores(prediction: Sequence[Prediction], positions: Sequence[Position]) -> l
     return [row for _, row in sorted(rows, key=lambda pair: (not pair[1].beaten_by, -pair[0]))]
 
 
-def _scored(p: Position, horizon_s: float, errors: Mapping[str, float | None]) -> tuple[float, HeldOut]:
+def _scored(p: Position, horizon_s: float, errors: Mapping[str, float | None]) -> tuple[float, ComparedError]:
     """Return the error of a position over that of the best baseline, and the row of the position.
 
     Errors below the noise of the measurement count as the noise.
@@ -64,11 +64,13 @@ def _scored(p: Position, horizon_s: float, errors: Mapping[str, float | None]) -
     # The model without delays is a rough fit: it is shown, and decides nothing.
     others = {m: e for m, e in finite.items() if m != NO_DELAY}
     beaten_by = () if error <= noise else tuple(m for m, e in others.items() if error > _BETTER * e)
-    rmse = {m: e if math.isfinite(e) else None for m, e in {"identified": error, **finite}.items()}
-    return excess, HeldOut(p.name, p.column, p.unit, horizon_s, rmse, beaten_by)
+    size, *others_ = [e if math.isfinite(e) else None for e in (error, *finite.values())]
+    baselines = dict(zip(finite, others_, strict=True))
+    place = ("held-out data", p.column, p.name, p.unit, AHEAD, horizon_s)
+    return excess, ComparedError(*place, size, beaten_by=beaten_by, baselines=baselines)
 
 
-def errors_of(row: HeldOut) -> dict[str, float]:
+def errors_of(row: ComparedError) -> dict[str, float]:
     """Return model -> root mean square error of a position; infinite where the model diverged."""
     return {model: math.inf if error is None else error for model, error in row.rmse.items()}
 
@@ -89,7 +91,7 @@ class Lack:
 
 
 def judge(
-    held_out: Sequence[HeldOut],
+    held_out: Sequence[ComparedError],
     table: ParameterTable,
     x: np.ndarray,
     spread: Uncertainty,
@@ -182,11 +184,11 @@ def _absent(table: ParameterTable, spread: Uncertainty) -> list[str]:
     return messages
 
 
-def _on_held_out(held_out: Sequence[HeldOut]) -> tuple[bool, list[str]]:
+def _on_held_out(held_out: Sequence[ComparedError]) -> tuple[bool, list[str]]:
     """Return whether every position beats every baseline on held-out data, and sentences about it."""
     if not held_out:
         return True, ["no data was held out: the error of its predictions is unknown"]
-    ahead = f"{held_out[0].horizon_s:g} s ahead on held-out data"
+    ahead = f"{held_out[0].seconds:g} s ahead on held-out data"
     worse = [s for s in held_out if s.beaten_by]
     if worse:
         reasons = [f"{ahead} {s.name} is no better than: {_errors(s)}" for s in worse[:_MOST]]
@@ -199,7 +201,7 @@ def _on_held_out(held_out: Sequence[HeldOut]) -> tuple[bool, list[str]]:
     return True, reasons
 
 
-def _off(row: HeldOut) -> str:
+def _off(row: ComparedError) -> str:
     """Return how far a position is off, and how far the best baseline is."""
     errors = errors_of(row)
     sentence = f"{row.name} is off by {errors.pop('identified'):.2g} {row.unit}".rstrip()
@@ -211,13 +213,13 @@ def _off(row: HeldOut) -> str:
     return f"{sentence}; {_BASELINES.get(best, best)} by {errors[best]:.2g} {row.unit}".rstrip()
 
 
-def _needs_delay(row: HeldOut) -> bool:
+def _needs_delay(row: ComparedError) -> bool:
     """Return whether the same model without delays is worse."""
     errors = errors_of(row)
     return NO_DELAY not in errors or errors["identified"] < _BETTER * errors[NO_DELAY]
 
 
-def _errors(row: HeldOut) -> str:
+def _errors(row: ComparedError) -> str:
     """Return the baselines that beat a position, with the errors."""
     errors, unit = errors_of(row), f" {row.unit}".rstrip()
     better = ", ".join(f"{m} ({errors[m]:.2g}{unit})" for m in row.beaten_by)

@@ -98,9 +98,9 @@ def _tiles(result: Identification) -> Iterator[Tile]:
     """Yield the worst position, the delays, the residuals and the search."""
     for row in result.held_out[:1]:
         which = f"{row.name}, the worst of {len(result.held_out)}," if len(result.held_out) > 1 else row.name
-        note = ", ".join(f"{m} {number(e, 3)}" for m, e in row.rmse.items() if m != "identified")
-        error = f"{number(row.rmse['identified'], 3)} {pretty_unit(row.unit)}".strip()
-        yield Tile(f"held-out RMSE of {which} after {row.horizon_s:g} s", error, note)
+        note = ", ".join(f"{m} {number(e, 3)}" for m, e in row.baselines.items())
+        error = f"{number(row.error, 3)} {pretty_unit(row.unit)}".strip()
+        yield Tile(f"held-out RMSE of {which} after {row.seconds:g} s", error, note)
     for e in result.parameters:
         if e.kind == "derived" and e.unit == "s":
             error = "" if e.standard_error is None else f" ± {1e3 * e.standard_error:.1f}"
@@ -410,7 +410,7 @@ def _predictions(result: Identification) -> list[Block]:
     if result.free or result.samples:
         blocks.append(_prediction_figure(result))
     if len(result.held_out) > 1:
-        caption = f"Held-out RMSE of every position after {result.held_out[0].horizon_s:g} s, the largest first"
+        caption = f"Held-out RMSE of every position after {result.held_out[0].seconds:g} s, the largest first"
         blocks.append(replace(TableBlock.of(caption, result.held_out_table()), folded=True))
     if result.prediction:
         fields = list(dict.fromkeys(f for row in result.prediction for f in row.rmse))

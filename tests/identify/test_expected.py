@@ -32,7 +32,7 @@ def judged(parts, error=0.01, wider=1.0, measured=None):
         (),
         samples=rows,
         free=rows,
-        prediction=(Prediction("identified", 2.0, True, {}, {}),),
+        prediction=(Prediction("identified", 2.0, True, {}),),
     )
     return with_expected_errors(document, [JOINT], parts, ["log"], 1, [{JOINT.column: wider}])
 

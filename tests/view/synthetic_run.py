@@ -94,7 +94,7 @@ def parameters(truth: bool = True) -> dict[str, Any]:
     """Return parameters.json; ``truth``: with the true values, as of an emulated robot."""
     names = [EVIL, "friction", "sensor_delay"]
     return {
-        "format": 3,
+        "format": 4,
         "pipeline": "pendulum",
         "logs": [{"path": "../record/session.mcap", "sha256": "0" * 64}],
         "verdict": {"status": "change the model", "reasons": ["at a bound: friction", "sensor_delay is <b>loose</b>"]},
@@ -125,8 +125,8 @@ def parameters(truth: bool = True) -> dict[str, Any]:
         ],
         "held_out": [
             {
-                "name": n, "column": f, "unit": "rad", "horizon_s": 1.0, "beaten_by": b,
-                "rmse": {"identified": e, "no delay": 0.2, "nominal": 0.58, "hold": None},
+                "source": "held-out data", "name": n, "column": f, "unit": "rad", "kind": "ahead", "seconds": 1.0,
+                "error": e, "beaten_by": b, "baselines": {"no delay": 0.2, "nominal": 0.58, "hold": None},
             }
             for n, f, e, b in (("th", "th", 0.0234, ["no delay"]), (EVIL, "other", 0.0117, []))
         ],

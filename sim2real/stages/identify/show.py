@@ -76,7 +76,7 @@ def summary(identification: Identification) -> dict[str, str]:
         lines["position"] = f"{which}, on held-out data"
         for model, error in worst.rmse.items():
             if error is not None:
-                lines[f"{model}, {worst.horizon_s:g} s ahead"] = f"{error:.4f}{unit}"
+                lines[f"{model}, {worst.seconds:g} s ahead"] = f"{error:.4f}{unit}"
         for model in ("identified", "hold"):
             runs = [r for r in identification.free_run if r.field == worst.column and r.model == model]
             if runs:

@@ -16,7 +16,6 @@ from sim2real.artifacts.identification import (
     FREE_RUN,
     ComparedError,
     ErrorKind,
-    HeldOut,
     Identification,
     compared_table,
 )
@@ -237,7 +236,7 @@ def score(
 
     # Predict windows of the horizon, and a free run of each log; a short log has shorter ones.
     expected = {(e.column, e.kind): e for e in identification.expected_error}
-    horizon_s = config.horizon_s or next((row.horizon_s for row in identification.held_out), fitting.horizon_s)
+    horizon_s = config.horizon_s or next((row.seconds for row in identification.held_out), fitting.horizon_s)
     run_s = config.free_run_s or max((b.seconds for k, b in expected.items() if k[1] == FREE_RUN), default=_FREE_RUN_S)
     errors, measured = list[ComparedError](), positions(model, robot.units)
     kinds: tuple[tuple[ErrorKind, float], ...] = ((AHEAD, horizon_s), (FREE_RUN, run_s))
@@ -253,18 +252,12 @@ def score(
                     seen = ranges(model, [log.episode for log in good], spans, windows.segment_s)
                     wider = wider_for(identification.ranges, seen, measured)
                     for row in _errors_on(windows, columns, r, list(values), measured, fitting.settle_s, seconds):
-                        limit = expected.get((row.column, kind))
-                        factor = wider.get(row.column, 1.0)
-                        errors.append(
-                            ComparedError(
-                                *(good[r].path.name, row.column, row.name, row.unit, kind, seconds),
-                                error=row.rmse["identified"],
-                                expected=None if limit is None else factor * limit.error,
-                                wider=factor,
-                                beaten_by=row.beaten_by if kind == AHEAD else (),
-                                baselines={m: e for m, e in row.rmse.items() if m != "identified" and kind == AHEAD},
-                            )
-                        )
+                        limit, factor = expected.get((row.column, kind)), wider.get(row.column, 1.0)
+                        limited = replace(row, kind=kind, wider=factor, source=good[r].path.name, seconds=seconds)
+                        if limit is not None:
+                            limited = replace(limited, expected=factor * limit.error)
+                        ahead = kind == AHEAD
+                        errors.append(limited if ahead else replace(limited, beaten_by=(), baselines={}))
     # A joint that rests is not compared: "no motion" would always be best.
     moved = {(e.source, e.column) for e in errors if e.kind == AHEAD}
     resting = {log.path.name: [p.name for p in measured if (log.path.name, p.column) not in moved] for log in good}
@@ -317,7 +310,7 @@ def _errors_on(
     measured: Sequence[Position],
     settle_s: float,
     seconds: float,
-) -> Iterator[HeldOut]:
+) -> Iterator[ComparedError]:
     """Yield the errors of the joints that move in one log."""
     segments = np.flatnonzero(windows.recording == recording)
     moves = dict(zip(prediction.labels(windows), moving(windows, segments), strict=True))
