@@ -46,7 +46,7 @@ _NAMES_OF_MODULE = {
     "sim2real.stages.export": ("export",),
     "sim2real.stages.identify.stage": ("identify",),
     "sim2real.stages.load": ("load_robot",),
-    "sim2real.stages.record.stage": ("record",),
+    "sim2real.stages.session.record": ("record",),
     "sim2real.stages.train.stage": ("train",),
     "sim2real.stages.validate.stage": ("validate",),
     "sim2real.training.networks.policy": ("Policy",),

@@ -41,7 +41,7 @@ from sim2real.stages.deploy.stage import deploy as deploy
 from sim2real.stages.export import export as export
 from sim2real.stages.identify.stage import identify as identify
 from sim2real.stages.load import load_robot as load_robot
-from sim2real.stages.record.stage import record as record
+from sim2real.stages.session.record import record as record
 from sim2real.stages.train.stage import train as train
 from sim2real.stages.validate.stage import validate as validate
 from sim2real.training.networks.policy import Policy as Policy

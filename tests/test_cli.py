@@ -17,6 +17,7 @@ from sim2real import cli, errors
 from sim2real.artifacts import run as run_folder
 from sim2real.artifacts.identification import Identification, Judgement
 from sim2real.commands import flags, run, stages
+from sim2real.commands.stages import module_of
 from sim2real.stages.config import RecordConfig
 from sim2real.stages.load import defaults_of
 from sim2real.stages.validate.config import ValidateConfig
@@ -41,7 +42,7 @@ def calls(monkeypatch, tmp_path):
                 folder.summary({"seed": config.seed})
             return folder.result
 
-        module = ModuleType(f"sim2real.stages.{stage}.stage")
+        module = ModuleType(module_of(stage))
         module.run = run
         return module
 
@@ -50,18 +51,18 @@ def calls(monkeypatch, tmp_path):
     monkeypatch.setattr(run, "conclude", lambda run_dir: None)
     monkeypatch.setattr(run, "main_figures", lambda done: {})
     for stage in run_folder.STAGES:
-        monkeypatch.setitem(sys.modules, f"sim2real.stages.{stage}.stage", stand_in(stage))
+        monkeypatch.setitem(sys.modules, module_of(stage), stand_in(stage))
     return seen
 
 
 def fail_with(monkeypatch, error):
-    module = ModuleType("sim2real.stages.record.stage")
+    module = ModuleType("sim2real.stages.session.record")
 
     def run(*_):
         raise error
 
     module.run = run
-    monkeypatch.setitem(sys.modules, "sim2real.stages.record.stage", module)
+    monkeypatch.setitem(sys.modules, "sim2real.stages.session.record", module)
 
 
 def test_version(capsys):

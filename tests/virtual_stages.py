@@ -10,7 +10,7 @@ from sim2real.emulation import process
 from sim2real.emulation.plant import load_plant
 from sim2real.emulation.virtual import VirtualRobot
 from sim2real.runtime.asynchronous import AsyncGraph
-from sim2real.stages.on_robot import episode
+from sim2real.stages.session import episode
 
 
 class RobotClock(VirtualClock):

@@ -28,8 +28,8 @@ from sim2real.emulation.truth import TruthLog
 from sim2real.errors import Sim2RealError
 from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.safety.gate import SafetyGate
-from sim2real.stages.excitation.signals import excitation
 from sim2real.stages.load import load_robot
+from sim2real.stages.session.excitation import excitation
 
 CAUSES = {"none": "", "friction": "friction", "payload": "payload", "delay": "round_trip_delay"}
 """Change of the robot -> the parameter that the verdict must name."""

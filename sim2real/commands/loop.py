@@ -20,6 +20,7 @@ from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run import STAGES, StageFolder, finished, stage_status
 from sim2real.artifacts.summary import Shown
 from sim2real.commands.run import RunFlags
+from sim2real.commands.stages import module_of
 from sim2real.errors import DelayChanged, Sim2RealError, UsageError
 from sim2real.robots.robot import RecordedRobot, Robot
 from sim2real.stages.config import DeployConfig, IdentifyConfig, RecordConfig, TrainConfig
@@ -397,7 +398,7 @@ def run(
 
     def call(stage: str, config: Any, run_dir: Path | None) -> StageFolder:
         nonlocal home
-        done = importlib.import_module(f"sim2real.stages.{stage}.stage").run(robot, config, root, run_dir)
+        done = importlib.import_module(module_of(stage)).run(robot, config, root, run_dir)
         home = done.run_dir
         return done
 

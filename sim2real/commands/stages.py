@@ -155,12 +155,17 @@ def examples_of(*commands: str) -> str:
     return "\n".join(["examples", *(f"  sim2real {command}" for command in commands), "", EXIT_CODES])
 
 
+def module_of(stage: str) -> str:
+    """Return the name of the module whose ``run`` is a stage."""
+    return f"sim2real.stages.{'session.record' if stage == 'record' else f'{stage}.stage'}"
+
+
 def _imported(stage: str) -> Any:
     """Import a stage with JAX, which takes seconds; a terminal shows that they pass."""
     from sim2real.stages.terminal import console
 
     with console.progress(None, "loading") if sys.stderr.isatty() else nullcontext():
-        return importlib.import_module(f"sim2real.stages.{stage}.stage")
+        return importlib.import_module(module_of(stage))
 
 
 def _end(good: bool) -> None:

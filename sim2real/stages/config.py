@@ -6,7 +6,7 @@ from typing import Any
 from sim2real.hardware.safety.limits import GateLimits as GateLimits
 from sim2real.stages.deploy.config import DeployConfig as DeployConfig
 from sim2real.stages.identify.config import IdentifyConfig as IdentifyConfig
-from sim2real.stages.record.config import RecordConfig as RecordConfig
+from sim2real.stages.session.config import RecordConfig as RecordConfig
 from sim2real.stages.train.config import TrainConfig as TrainConfig
 
 MODEL_IDENTIFY = IdentifyConfig(

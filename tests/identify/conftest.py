@@ -12,8 +12,8 @@ from sim2real.identification.problem import Problem
 from sim2real.identification.segments import Span
 from sim2real.identification.uncertainty import from_linearised
 from sim2real.stages.config import RecordConfig
-from sim2real.stages.excitation.signals import excitation
 from sim2real.stages.load import load_module, load_robot
+from sim2real.stages.session.excitation import excitation
 
 SENSOR_DELAY_S, ACTUATOR_DELAY_S, MAX_DELAY_S = 0.0207, 0.0253, 0.06
 LEAD_S = 0.00005

@@ -10,8 +10,8 @@ import pytest
 from sim2real.errors import UsageError
 from sim2real.hardware.feetech import registers
 from sim2real.hardware.safety.limits import GateLimits
-from sim2real.stages.excitation.signals import excitation
 from sim2real.stages.load import load_module, load_robot
+from sim2real.stages.session.excitation import excitation
 
 PIPELINE = load_robot("so101")
 ROBOT, PLANT = PIPELINE, load_module(PIPELINE.name, "plant")

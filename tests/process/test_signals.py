@@ -45,7 +45,7 @@ def run(pipeline, config, root, run_dir):
         finally:
             print("torque off", flush=True)
 
-module = ModuleType("sim2real.stages.record.stage")
+module = ModuleType("sim2real.stages.session.record")
 module.run = run
 sys.modules[module.__name__] = module
 sys.exit(cli.main(["record", "pendulum"]))
@@ -88,7 +88,7 @@ def run(pipeline, config, root, run_dir):
             time.sleep(0.3)
             print("log closed", flush=True)
 
-module = ModuleType("sim2real.stages.record.stage")
+module = ModuleType("sim2real.stages.session.record")
 module.run = run
 sys.modules[module.__name__] = module
 sys.exit(cli.main(["record", "pendulum"]))

@@ -16,7 +16,7 @@ from sim2real.log.reader import read_log
 from sim2real.robots.messages import Goals
 from sim2real.robots.nodes import Excitation
 from sim2real.stages.load import load_robot, moving
-from sim2real.stages.on_robot.episode import run_episode
+from sim2real.stages.session.episode import Bench
 
 GATE = GateLimits(limit=1.5, slew_per_s=6.0, command_timeout_s=0.2, max_speed_rad_s=20.0, servo_watchdog_s=0.6)
 SIGNAL = np.concatenate([np.zeros((5, 3)), np.tile([0.3, 0.6, -0.4], (20, 1)), np.tile([0.2, 1.45, 0.1], (10, 1))])
@@ -66,10 +66,10 @@ def episodes(arm, tmp_path_factory):
         config = Config()
         robot.drive.prepare(session, 5.0)
         nodes = robot.recording_nodes(session, SIGNAL)
-        recorded = run_episode(robot, session, nodes, {}, logs[0], 1.0, config, "record")
+        recorded = Bench(robot, session, config).run_episode(nodes, {}, logs[0], 1.0, "record")
         robot.drive.prepare(session, 10.0)
         nodes, params = robot.deployment_nodes(session, policy, trial=2)
-        deployed = run_episode(robot, session, nodes, params, logs[1], 0.6, config, "deploy")
+        deployed = Bench(robot, session, config).run_episode(nodes, params, logs[1], 0.6, "deploy")
         left = session.rig.wait_until_still(5.0).position_rad
         robot.drive.prepare(session, 10.0)
         brought = session.rig.measure().position_rad

@@ -25,10 +25,10 @@ from sim2real.log import read_log
 from sim2real.robots.model.parameters import ParameterPattern
 from sim2real.robots.model.robot import MjcfRobot, RobotConfig
 from sim2real.stages.config import RecordConfig
-from sim2real.stages.excitation.signals import excitation
-from sim2real.stages.excitation.simulated_log import simulate
 from sim2real.stages.export import facts_of, write_model_card
 from sim2real.stages.load import load_robot
+from sim2real.stages.session.excitation import excitation
+from sim2real.stages.session.simulated_log import simulate
 
 ROOT = Path(__file__).resolve().parents[2]
 ALONE = """

@@ -16,9 +16,9 @@ from sim2real.identification.fit import fit
 from sim2real.identification.segments import Span
 from sim2real.log.reader import read_log
 from sim2real.stages.config import RecordConfig
-from sim2real.stages.excitation.signals import excitation
 from sim2real.stages.load import load_robot
-from sim2real.stages.on_robot.episode import run_episode
+from sim2real.stages.session.episode import Bench
+from sim2real.stages.session.excitation import excitation
 
 PATIENT = GateLimits(command_timeout_s=0.2, servo_watchdog_s=0.6)
 GEARS = (2.0, 0.5)
@@ -52,7 +52,7 @@ def test_goals_and_limits_are_the_joints_on_the_bus_too(arm, tmp_path, virtual_r
     with robot.drive.connect("embedded", PATIENT, tmp_path / "truth.bin", 0) as session:
         robot.drive.prepare(session, 5.0)
         nodes = robot.recording_nodes(session, np.tile(goal, (90, 1)))
-        run_episode(robot, session, nodes, {}, tmp_path / "log.mcap", 1.6, RecordConfig(), "record")
+        Bench(robot, session, RecordConfig()).run_episode(nodes, {}, tmp_path / "log.mcap", 1.6, "record")
     episode, truth = read_log(tmp_path / "log.mcap"), read_truth(tmp_path / "truth.bin")
     position = episode.outputs["sensor"]["position"]
     np.testing.assert_allclose(episode.outputs["actuator"]["goal"][-1], goal, atol=1e-6)
@@ -75,7 +75,7 @@ def test_what_is_identified_does_not_depend_on_how_the_joint_is_mounted(tmp_path
     log, truth = tmp_path / "log.mcap", tmp_path / "truth.bin"
     with robot.drive.connect("embedded", PATIENT, truth, 1) as session:
         nodes = robot.recording_nodes(session, excitation(config, 50.0, 1))
-        run_episode(robot, session, nodes, {}, log, config.duration_s, config, "record")
+        Bench(robot, session, config).run_episode(nodes, {}, log, config.duration_s, "record")
     episode, true = read_log(log), read_truth(truth)
     assert np.ptp(episode.outputs["sensor"]["th"]) > 1.0
     samples = true.of(Kind.SAMPLE)["values"]

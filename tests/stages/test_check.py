@@ -22,9 +22,9 @@ from sim2real.stages.check.stage import (
     coverage,
 )
 from sim2real.stages.config import RecordConfig
-from sim2real.stages.excitation.signals import excitation
-from sim2real.stages.excitation.simulated_log import simulate
 from sim2real.stages.load import load_robot
+from sim2real.stages.session.excitation import excitation
+from sim2real.stages.session.simulated_log import simulate
 from sim2real.stages.shared.arguments import open_recording
 
 LOG = Path(__file__).parents[2] / "datasets" / "pendulum" / "multisine.mcap"

@@ -17,13 +17,13 @@ def say(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
 
     def call(error, code):
-        module = ModuleType("sim2real.stages.record.stage")
+        module = ModuleType("sim2real.stages.session.record")
 
         def run(*_):
             raise error
 
         module.run = run
-        monkeypatch.setitem(sys.modules, "sim2real.stages.record.stage", module)
+        monkeypatch.setitem(sys.modules, "sim2real.stages.session.record", module)
         assert cli.main(["record", "pendulum"]) == code
         said = capsys.readouterr()
         assert not said.out

@@ -5,7 +5,7 @@ import pytest
 
 from sim2real.errors import UsageError
 from sim2real.stages.config import RecordConfig
-from sim2real.stages.excitation.signals import excitation
+from sim2real.stages.session.excitation import excitation
 
 
 @pytest.mark.parametrize("kind", ["multisine", "chirp", "steps"])

@@ -10,8 +10,8 @@ from sim2real import cli
 from sim2real.artifacts.run import newest
 from sim2real.errors import UsageError
 from sim2real.log.reader import read_log
-from sim2real.stages.excitation.played import played
 from sim2real.stages.load import load_module, load_robot
+from sim2real.stages.session.excitation import played
 
 ARM = load_robot("so101")
 SERVOS = ARM.drive.servos

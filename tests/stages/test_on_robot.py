@@ -16,9 +16,9 @@ from sim2real.emulation.truth import Kind, read_truth
 from sim2real.hardware.device import OperatingMode
 from sim2real.log.reader import read_log
 from sim2real.robots.nodes import Excitation
-from sim2real.stages.excitation.played import played
 from sim2real.stages.load import load_module, load_robot
-from sim2real.stages.on_robot import come_to_rest
+from sim2real.stages.session import episode
+from sim2real.stages.session.excitation import played
 from sim2real.view.delay_parts import parts_of
 
 
@@ -99,7 +99,7 @@ def test_a_robot_that_would_fall_is_held_until_it_is_told(tmp_path, virtual_robo
         held_ns.append(virtual_robots[0].now_ns())
         return len(held_ns) > 25  # half a second
 
-    monkeypatch.setattr(come_to_rest, "_told", told)
+    monkeypatch.setattr(episode, "_told", told)
     bundle = make_bundle("arm", tmp_path, 0.2)
     code, said, folder = deploy(tmp_path, "arm", bundle, "--hold", "--duration-s", 1)
     assert code == 0

@@ -7,7 +7,7 @@ import pytest
 
 from sim2real.errors import DeadlineExceeded, SafetyStop
 from sim2real.graph.episode import MemoryRecorder, MessageRecord, StepRecord
-from sim2real.stages.on_robot import episode as session
+from sim2real.stages.session import episode as session
 
 
 def step(seq, node="sensor"):

@@ -37,8 +37,8 @@ def record(
     from sim2real.emulation.truth import TruthLog
     from sim2real.hardware.registry import load_named
     from sim2real.robots.servo.drive import approached
-    from sim2real.stages.excitation.signals import excitation
     from sim2real.stages.load import load_robot
+    from sim2real.stages.session.excitation import excitation
 
     pipeline = load_robot("go2")
     robot: Any = pipeline

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from sim2real.errors import UsageError
 from sim2real.stages.flag import Flag
-from sim2real.stages.record.config import RecordConfig
+from sim2real.stages.session.config import RecordConfig
 
 
 @dataclass(frozen=True)

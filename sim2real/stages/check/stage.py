@@ -27,9 +27,9 @@ from sim2real.log.importing.names import about_torque
 from sim2real.log.schema import unit_of
 from sim2real.robots.robot import RecordedRobot, Robot, in_world
 from sim2real.stages.check.config import CheckConfig
-from sim2real.stages.excitation.played import played
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.load import AnyRobot, defaults_of, robot_of
+from sim2real.stages.session.excitation import played
 from sim2real.stages.shared.arguments import AnyRecording, config_of, open_recording, recordings_of
 from sim2real.stages.shared.identification import command, side_by_side, usable
 from sim2real.stages.terminal.console import artifact_table, note, pairs, progress, shown
@@ -343,7 +343,7 @@ def _planned(
         raise UsageError("a recording of standing determines the load alone", hint="plan another --record.excitation")
     if not has_jax():
         raise NotInstalled("a plan is simulated with JAX, which is not installed here", hint="name a log with --log")
-    from sim2real.stages.excitation.simulated_log import simulate  # JAX programs
+    from sim2real.stages.session.simulated_log import simulate  # JAX programs
 
     signal = robot.drive.around(played(config.record, robot))
     table = parameters.for_recordings(1)

@@ -1,6 +1,6 @@
 """The episodes of a deployment on the robot: open it, measure its delay, run the policy."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,13 +18,12 @@ from sim2real.log.writer import McapRecorder
 from sim2real.policy.contract import PolicyContract
 from sim2real.policy.runner import BlendedRunner, UprightRunner
 from sim2real.robots.loop import ACTUATOR, SENSOR
-from sim2real.robots.probe import StepAnswers, Witness, measure_delay
-from sim2real.robots.robot import Robot, Session
+from sim2real.robots.probe import Probe, StepAnswers, Witness, measure_delay
+from sim2real.robots.robot import Robot
 from sim2real.stages.deploy.config import DeployConfig
 from sim2real.stages.live.scene import scene_of
 from sim2real.stages.live.viewer import live_view
-from sim2real.stages.on_robot.episode import check_deadlines, run_episode
-from sim2real.stages.on_robot.open_robot import announce_following, opened
+from sim2real.stages.session.episode import Bench, opened
 from sim2real.stages.terminal.console import note
 from sim2real.types import Json
 
@@ -49,23 +48,26 @@ def run_episodes(
     """
     policy, folder = _policy_runner(bundle, robot, config), logs[0].parent
     scene = partial(scene_of, robot)
-    with live_view(config.view, folder, robot.name, scene), opened(robot, config, folder / TRUTH) as session:
-        if config.hold and session.rig.gate.config.stale != "hold":
+    with live_view(config.view, folder, robot.name, scene), opened(robot, config, folder / TRUTH) as bench:
+        if config.hold and bench.rig.gate.config.stale != "hold":
             raise UsageError("this robot's motors hold no position", hint="run without --hold")
         if following is not None:
-            session.rig.follow(following)
-        announce_following(session.rig)
+            bench.rig.follow(following)
+        _announce_following(bench.rig.following)
         # Measure the delay before the policy moves the robot: a policy trained for another delay may oscillate.
-        delay = _measure_delay(robot, session, bundle, config, folder)
-        summaries = [_run_one(robot, session, policy, i, log, config) for i, log in enumerate(logs)]
+        delay = _measure_delay(bench, bundle.contract, folder)
+        summaries = [_run_one(bench, policy, i, log) for i, log in enumerate(logs)]
     return [{**summary, **delay} for summary in summaries]
 
 
-def check_timing(summaries: Sequence[Mapping[str, Json]], config: DeployConfig) -> None:
-    """Raise the error of ``--strict-timing`` if a session has too many late steps."""
-    if config.strict_timing:
-        for summary in summaries:
-            check_deadlines(summary)
+def _announce_following(following: Following | None) -> None:
+    """Print by which figures joints are watched that do not follow their commands; or that none are."""
+    if following is None:
+        note("no motor is watched for letting go: how it follows its commands is not known, or following_rad is inf")
+        return
+    limit = np.max(following.limit)
+    most = f"{limit:.0%} of their push" if following.unit == "1" else f"{limit:.2g} {following.unit}"
+    note(f"a joint that is more than {most} off its commands stops the robot, by {following.source}")
 
 
 def _policy_runner(bundle: Bundle, robot: Robot, config: DeployConfig) -> PolicyRunner:
@@ -75,44 +77,37 @@ def _policy_runner(bundle: Bundle, robot: Robot, config: DeployConfig) -> Policy
     return blended if limit_rad is None or tilt_rad is None else UprightRunner(blended, tilt_rad, limit_rad)
 
 
-def _measure_delay(
-    robot: Robot, session: Session, bundle: Bundle, config: DeployConfig, folder: Path
-) -> dict[str, str]:
+def _measure_delay(bench: Bench, contract: PolicyContract, folder: Path) -> dict[str, str]:
     """Bring the robot to rest, measure its delay with small steps and log them; return a line of the summary."""
-    if config.dry_run or not config.measure_delay or robot.drive.probe is None:
+    config, drive = bench.config, bench.robot.drive
+    if config.dry_run or not config.measure_delay or drive.probe is None:
         return {}
     note("waiting for the robot to come to rest, then a few small steps to measure its delay")
-    robot.drive.prepare(session, config.settle_s)
-    witness = Witness(session.rig)
+    drive.prepare(bench.session, config.settle_s)
+    witness = Witness(bench.rig)
     try:
-        return check_delay(robot, witness, bundle.contract, config)
+        return check_delay(drive.probe, witness, contract, config)
     finally:
-        _write_probe(folder, robot, witness)
+        _write_probe(folder / PROBE, bench.robot, witness)
 
 
-def _run_one(
-    robot: Robot,
-    session: Session,
-    policy: PolicyRunner,
-    trial: int,
-    log: Path,
-    config: DeployConfig,
-) -> dict[str, Json]:
+def _run_one(bench: Bench, policy: PolicyRunner, trial: int, log: Path) -> dict[str, Json]:
     """Run one episode; return the summary of its session."""
+    config = bench.config
     length = f"{config.duration_s:g} s on {config.port}"
     if config.dry_run:
         note(f"dry run: the robot is not moved to its start; {length}")
     else:
         note(f"waiting for the robot to come to rest, then {length}")
-        robot.drive.prepare(session, config.settle_s)
-    nodes, params = robot.deployment_nodes(session, policy, trial)
-    return run_episode(robot, session, nodes, params, log, config.duration_s, config, "deploy", config.hold)
+        bench.robot.drive.prepare(bench.session, config.settle_s)
+    nodes, params = bench.robot.deployment_nodes(bench.session, policy, trial)
+    return bench.run_episode(nodes, params, log, config.duration_s, "deploy")
 
 
 # -- the test of the delay, and its log: the model is tested on it as on an episode
 
 
-def check_delay(robot: Robot, witness: Witness, contract: PolicyContract, config: DeployConfig) -> dict[str, str]:
+def check_delay(probe: Probe, witness: Witness, contract: PolicyContract, config: DeployConfig) -> dict[str, str]:
     """Measure the robot's delay with small steps, and refuse a policy that was not trained with it.
 
     Args:
@@ -125,16 +120,14 @@ def check_delay(robot: Robot, witness: Witness, contract: PolicyContract, config
         DelayChanged: The delay, or its variation, lies outside of the range in training.
         Sim2RealError: The robot does not answer.
     """
-    if not config.measure_delay or config.dry_run or robot.drive.probe is None:
-        return {}
     if (trained := contract.trained_s.get(ROUND_TRIP)) is None:
         note("warning: the bundle does not list the delays of its training, so the robot's delay is not measured")
         return {}
     # A busy machine may delay single steps, so a misfit is measured a second time.
-    answers = measure_delay(witness, robot.drive.probe)
+    answers = measure_delay(witness, probe)
     if misfit(answers, trained, config.delay_tolerance_s):
         witness.rig.wait_until_still(config.settle_s)
-        more = measure_delay(witness, robot.drive.probe).delays_s
+        more = measure_delay(witness, probe).delays_s
         answers = replace(answers, delays_s=np.append(answers.delays_s, more))
     measured = f"{1e3 * answers.delay_s:.0f} ms, the middle half within {1e3 * answers.jitter_s:.0f} ms"
     if reason := misfit(answers, trained, config.delay_tolerance_s):
@@ -165,17 +158,14 @@ def misfit(answers: StepAnswers, trained: tuple[float, float], tolerance_s: floa
     return None
 
 
-def _write_probe(folder: Path, robot: Robot, witness: Witness) -> Path | None:
-    """Write the commands and measurements of the steps at the robot's rate; return the log.
+def _write_probe(log: Path, robot: Robot, witness: Witness) -> None:
+    """Write the commands and measurements of the steps at the robot's rate; without a step nothing.
 
     The steps ran faster than that. The log omits the measurements in between, so that a second of it weighs as much as
     a second of any other log, and it omits repeated commands.
-
-    Returns:
-        None if no step was made.
     """
     if not witness.measured or not witness.sent:
-        return None
+        return
     # Select the measurements and commands at the robot's rate; a command that changes is always selected.
     sensor, actuator = SENSOR, ACTUATOR
     period_ns, start_ns = round(1e9 / robot.rate_hz), min(witness.measured[0][0], witness.sent[0][0])
@@ -187,7 +177,7 @@ def _write_probe(folder: Path, robot: Robot, witness: Witness) -> Path | None:
     graph = {n: {"rate_hz": robot.rate_hz, "delay_s": 0.0, "inputs": {}} for n in outputs}
     metadata = {"pipeline": robot.name, "dry_run": False, "graph": graph, "probe": True}
     joints, units = {sensor: robot.sensor.joints}, dict.fromkeys(outputs, robot.units)
-    recorder = McapRecorder(folder / PROBE, metadata, {}, outputs, [], joints, units)
+    recorder = McapRecorder(log, metadata, {}, outputs, [], joints, units)
     recorder.start(0, start_ns)
     rows = [
         (sensor, k, *witness.measured[i][:2], robot.sensor.read(witness.measured[i][2])) for k, i in enumerate(measured)
@@ -197,7 +187,6 @@ def _write_probe(folder: Path, robot: Robot, witness: Witness) -> Path | None:
         begin, end = ((t_ns - start_ns) // 1000 for t_ns in times_ns)
         recorder.step(StepRecord(node, seq, begin, begin, begin, -1, end, 0), output)
     recorder.close("finished", 0, {})
-    return folder / PROBE
 
 
 def _apart(times_ns: list[int], period_ns: int, always: list[bool] | None = None) -> list[int]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,12 +16,14 @@ from sim2real.hardware.safety.following import Following
 from sim2real.installation import has_jax
 from sim2real.robots.robot import RecordedRobot, Robot, in_world
 from sim2real.stages.deploy.config import DeployConfig
-from sim2real.stages.deploy.episodes import check_timing, run_episodes
+from sim2real.stages.deploy.episodes import run_episodes
 from sim2real.stages.deploy.preflight import find_bundle, require_fit
-from sim2real.stages.deploy.show import show, show_sessions, summary_lines
 from sim2real.stages.load import AnyRobot, defaults_of, moving, robot_of
+from sim2real.stages.session.episode import check_deadlines, show_sessions
 from sim2real.stages.shared import arguments
 from sim2real.stages.shared.arguments import check_parameters, open_identification
+from sim2real.stages.terminal.console import artifact_table, note
+from sim2real.types import Json
 
 
 def deploy(
@@ -113,6 +115,8 @@ def run(robot: RecordedRobot, config: DeployConfig, root: Path, run_dir: Path | 
         deployment = _deployed(robot, bundle, stage.folder, config, identification)
         summaries = deployment.summary
         show_sessions(summaries, config.dry_run, config.port == "embedded")
+        if config.dry_run:
+            note("dry run: the robot did not move, so there is no gap report")
 
         # Write the results, then the page about them.
         for name, file in deployment.save(stage.folder).items():
@@ -122,9 +126,10 @@ def run(robot: RecordedRobot, config: DeployConfig, root: Path, run_dir: Path | 
         for i, recording in enumerate(deployment.recordings):
             for name, file in recording.timing.save(stage.folder, f"timing_{i}").items():
                 stage.output(name, file)
-        show(deployment)
-        stage.summary(summary_lines(deployment, summaries))
-        check_timing(summaries, config)
+        _show(deployment)
+        stage.summary(_summary_lines(deployment, summaries))
+        for summary in summaries if config.strict_timing else ():
+            check_deadlines(summary)
     return stage.result
 
 
@@ -152,3 +157,34 @@ def _identification(robot: RecordedRobot, run_dir: Path) -> Identification | Non
     """Return the run's newest identification; None if the run has none."""
     folder = finished(run_dir, "identify")
     return None if folder is None else open_identification(folder.output("parameters"), robot)
+
+
+def _show(deployment: Deployment) -> None:
+    """Print the gap to simulation, the tests of the model and the verdict of a deployment."""
+    if deployment.gap:
+        print(artifact_table(deployment.rows()))
+    if deployment.trained:
+        print(artifact_table(deployment.times_table()))
+    if deployment.replay:
+        print(artifact_table(deployment.replay_table()))
+    if deployment.drift is not None:
+        print(artifact_table(deployment.drift.rows()))
+    if deployment.advice is not None:
+        note(f"verdict: {deployment.advice.status}")
+        for reason in deployment.advice.reasons:
+            note(f"  {reason}")
+        if deployment.advice.next:
+            note(f"next: {deployment.advice.next}")
+
+
+def _summary_lines(deployment: Deployment, summaries: Sequence[Mapping[str, Json]]) -> dict[str, Json]:
+    """Return the lines that the console prints at the end."""
+    scores = {f"success, deployment {i}": e.real.get("success") for i, e in enumerate(deployment.episodes)}
+    last = summaries[-1]
+    return {
+        **{name: round(value, 3) for name, value in scores.items() if value is not None},
+        **{name: value for name, value in last.items() if name == "measured delay"},
+        "lost replies": last["lost_replies"],
+        "late replies": last["late_replies"],
+        "command timeouts": last["command_timeouts"],
+    }

@@ -11,18 +11,17 @@ import numpy as np
 from sim2real.artifacts.recording import LOG, TRUTH, Recording
 from sim2real.artifacts.run import StageFolder, open_stage
 from sim2real.installation import has_jax
+from sim2real.robots.loop import SENSOR
 from sim2real.robots.robot import RecordedRobot, Robot
 from sim2real.stages.check.config import CheckConfig
-from sim2real.stages.excitation.played import played
 from sim2real.stages.live.scene import scene_of
 from sim2real.stages.live.viewer import live_view
 from sim2real.stages.load import AnyRobot, defaults_of, moving, robot_of
-from sim2real.stages.on_robot.episode import check_deadlines, run_episode
-from sim2real.stages.on_robot.open_robot import opened
-from sim2real.stages.record.config import RecordConfig
-from sim2real.stages.record.show import show, show_by_hand, show_open
+from sim2real.stages.session.config import RecordConfig
+from sim2real.stages.session.episode import check_deadlines, opened, show_sessions
+from sim2real.stages.session.excitation import played
 from sim2real.stages.shared.arguments import AnyPath, config_of, folder_of
-from sim2real.stages.terminal.console import note
+from sim2real.stages.terminal.console import note, shown, table
 from sim2real.types import Json
 
 
@@ -43,16 +42,15 @@ def record(robot: AnyRobot, folder: AnyPath, config: RecordConfig | Mapping[str,
     robot, folder = moving(robot_of(robot)), folder_of(folder)
     config = config_of(config, defaults_of(robot).record)
     log, truth = folder / LOG, folder / TRUTH
-    scene = partial(scene_of, robot)
     signal = None if config.by_hand else _planned(config, robot)
     duration_s = config.duration_s if signal is None else len(signal) / robot.rate_hz
     note(f"recording {duration_s:g} s of {config.excitation} on {config.port}")
-    with live_view(config.view, folder, robot.name, scene), opened(robot, config, truth) as session:
+    with live_view(config.view, folder, robot.name, partial(scene_of, robot)), opened(robot, config, truth) as bench:
         if signal is None:
-            session.rig.withhold_torque()
+            bench.rig.withhold_torque()
             note("torque is off: move the robot by hand", urgent=True)
-        nodes = robot.recording_nodes(session, signal, config.standing)
-        run_episode(robot, session, nodes, {}, log, duration_s, config, "record")
+        nodes = robot.recording_nodes(bench.session, signal, config.standing)
+        bench.run_episode(nodes, {}, log, duration_s, "record")
     return Recording.load(log, truth)
 
 
@@ -61,12 +59,18 @@ def _planned(config: RecordConfig, robot: Robot) -> np.ndarray:
     signal = played(config, robot, announce=True)
     if config.motion is None or config.dry_run:
         return signal
-    if has_jax():
-        from sim2real.stages.check.stage import check  # JAX programs take seconds to compile
-
-        show_open(check(robot, None, CheckConfig(plan=True, record=config)))
-    else:
+    if not has_jax():
         note("which parameters this motion determines is not checked: JAX is not installed here")
+        return signal
+    from sim2real.stages.check.stage import check  # JAX programs take seconds to compile
+
+    checked = check(robot, None, CheckConfig(plan=True, record=config))
+    if groups := [", ".join(group) for group in checked.undetermined]:
+        note(f"motion: its recording does not determine {' or '.join(groups)}", urgent=True)
+        for message in checked.messages:
+            note(f"- {message}")
+    else:
+        note("motion: its recording determines all parameters")
     return signal
 
 
@@ -88,9 +92,9 @@ def run(robot: RecordedRobot, config: RecordConfig, root: Path, run_dir: Path | 
         summary = recording.summary
         for name, path in recording.timing.save(stage.folder).items():
             stage.output(name, path)
-        show(summary, config.dry_run, config.port == "embedded")
+        show_sessions([summary], config.dry_run, config.port == "embedded")
         if config.by_hand:
-            show_by_hand(recording, robot)
+            _show_by_hand(recording, robot)
         stage.summary(
             {
                 "seconds": config.duration_s,
@@ -103,3 +107,16 @@ def run(robot: RecordedRobot, config: RecordConfig, root: Path, run_dir: Path | 
         if config.strict_timing:
             check_deadlines(summary)
     return stage.result
+
+
+def _show_by_hand(recording: Recording, robot: Robot) -> None:
+    """Print how far each joint was moved by hand, and the command that plays the motion."""
+    outputs, rows = recording.episode.outputs[SENSOR], []
+    for channel in robot.sensor.channels:
+        values = np.asarray(channel.of(outputs[channel.position]), np.float64)
+        rows.append([channel.label or channel.position, values.min(), values.max(), np.ptp(values)])
+    print(table(rows, ["joint", "lowest [rad]", "highest [rad]", "moved by [rad]"]))
+    note(
+        "torque was off and the torque of the hand is not measured, so this log determines no parameter\n"
+        f"next: sim2real record {robot.name} --excitation {shown(recording.path)}"
+    )

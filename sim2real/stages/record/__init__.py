@@ -1,1 +1,0 @@
-"""The stage record: the robot under an excitation."""

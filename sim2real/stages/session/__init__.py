@@ -1,0 +1,1 @@
+"""The stage record, and what moves the robot: excitation, open robot, episode."""

@@ -1,0 +1,383 @@
+"""The open robot of a stage: one episode after another on the wall clock, their logs, and how well they kept time."""
+
+import math
+import select
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim2real.artifacts.files import plain
+from sim2real.artifacts.run import git_state, versions
+from sim2real.errors import ERROR, OK, DeadlineExceeded, SafetyStop, Sim2RealError, UsageError
+from sim2real.graph.base import GraphState
+from sim2real.graph.episode import MessageRecord, Recorder, StepRecord, named_leaves
+from sim2real.graph.node import BaseNode
+from sim2real.hardware.clock import Clock
+from sim2real.hardware.safety.rig import Rig
+from sim2real.installation import has_jax
+from sim2real.later import jax
+from sim2real.log.writer import McapRecorder
+from sim2real.robots.loop import ACTUATOR, AGENT, ROLES, SENSOR
+from sim2real.robots.robot import Robot
+from sim2real.robots.session import Session
+from sim2real.runtime.asynchronous import AsyncGraph
+from sim2real.runtime.clock import realtime
+from sim2real.runtime.failure import noted
+from sim2real.stages.deploy.config import DeployConfig
+from sim2real.stages.session.config import RecordConfig
+from sim2real.stages.terminal.console import note, progress, table
+from sim2real.stages.terminal.interruption import interruptible
+
+LATE_SHARE = 0.01
+"""Share of late steps above which ``--strict-timing`` ends with code 5, and of late answers above which it is said."""
+_POLL_S, _REST_POLL_S = 0.25, 0.02
+WARN_BEHIND_S = 1.0
+"""Age of the record that is being written above which a warning names the slow disk [s]."""
+_INTERRUPTED = 130
+
+
+class Watch:
+    """A recorder that passes everything on, and stops the graph on a NaN.
+
+    Args:
+        actuator: The node whose commands are summarised.
+        field: Field of its output with a number for each motor.
+
+    Attributes:
+        monotonic_ns: When the episode started.
+        commands: Number of the actuator's commands.
+        low, total, high: Of each motor, over these commands.
+    """
+
+    def __init__(self, recorder: Recorder, actuator: str, field: str) -> None:
+        self._recorder, self._actuator, self._field = recorder, actuator, field
+        self.monotonic_ns = self.commands = 0
+        self.low, self.total, self.high = np.array([np.inf]), np.zeros(1), np.array([-np.inf])
+
+    def start(self, epoch_ns: int, monotonic_ns: int) -> None:
+        """Keep when the episode starts."""
+        self.monotonic_ns = monotonic_ns
+        self._recorder.start(epoch_ns, monotonic_ns)
+
+    def step(self, record: StepRecord, output: Any) -> None:
+        """Pass a step on."""
+        self._recorder.step(record, output)
+        leaves = named_leaves(output)
+        for name, leaf in leaves.items():
+            values = np.asarray(leaf)
+            if values.dtype.kind == "f" and np.isnan(values).any():
+                raise SafetyStop(f"node {record.node!r} stopped: its output {name!r} is NaN in step {record.seq}")
+        if record.node == self._actuator:
+            sent = np.atleast_1d(np.asarray(leaves[self._field], np.float64))
+            self.commands, self.total = self.commands + 1, self.total + sent
+            self.low, self.high = np.minimum(self.low, sent), np.maximum(self.high, sent)
+
+    def message(self, record: MessageRecord) -> None:
+        """Pass the fate of a message on."""
+        self._recorder.message(record)
+
+
+@contextmanager
+def opened(robot: Robot, config: RecordConfig | DeployConfig, truth_path: Path) -> "Iterator[Bench]":
+    """Open the robot for a stage, with torque off; in a dry run with torque withheld until it is closed.
+
+    Args:
+        config: Port, limits, seed, and whether it is a dry run.
+
+    Raises:
+        UsageError: The session has no rig, or its device moves in a dry run.
+    """
+    if config.dry_run:
+        note("dry run: torque stays off and no goal is sent; what would have been sent is logged")
+    hanging = isinstance(config, RecordConfig) and not config.standing
+    limits = config.gate.on(config.port)
+    with robot.drive.connect(config.port, limits, truth_path, config.seed, hanging) as session, realtime():
+        # Sessions come from plug-ins too: refuse what has no safety gate, no guardian and no dry run.
+        if not isinstance(session.rig, Rig):
+            raise UsageError(
+                f"this robot's session has a {type(session.rig).__name__} for a rig",
+                hint="make its `rig` a sim2real.hardware.safety.rig.Rig of a sim2real.hardware.device.Device",
+            )
+        if config.dry_run:
+            session.rig.withhold_torque()
+        for line in session.rig.device.without_host():
+            note(f"if this process dies: {line}; the guardian takes the torque off", config.port != "embedded")
+        yield Bench(robot, session, config)
+
+
+@dataclass(frozen=True)
+class Bench:
+    """An open robot with the settings of the stage that opened it."""
+
+    robot: Robot
+    session: Session
+    config: Any
+
+    @property
+    def rig(self) -> Rig:
+        """The motors behind the safety gate."""
+        return self.session.rig
+
+    def run_episode(
+        self, nodes: Mapping[str, BaseNode], params: Mapping[str, Any], log: Path, duration_s: float, label: str
+    ) -> dict[str, Any]:
+        """Run the graph and log it; after every failure the motors have no torque and the log is readable.
+
+        Args:
+            duration_s: How long to run [s].
+
+        Returns:
+            The summary, which the log's ``session_end`` has too: timing by node, losses, the gate's counts.
+
+        Raises:
+            Sim2RealError: What stopped the robot.
+        """
+        hold = getattr(self.config, "hold", False)
+        # Without an agent, as in a recording by hand, the sensor is the only node.
+        graph = AsyncGraph(nodes, nodes.get(AGENT) or nodes[SENSOR])
+        state = graph.init(jax.random.key(0) if has_jax() else None, params)
+        graph.warmup(state)  # every program is compiled before torque goes on
+        # Start the log, and run; an interrupted episode comes to rest before torque goes off.
+        recorder = self._recorder(graph, state, log)
+        watch = Watch(recorder, ACTUATOR, self.robot.drive.command)
+        graph.recorder = watch
+        try:
+            try:
+                _drive(graph, state, duration_s, label, recorder, self.rig.clock)
+            except (KeyboardInterrupt, SystemExit):
+                with interruptible():  # a second signal stops at once
+                    come_to_rest(graph, self.rig, hold)
+                raise
+            if hold:
+                come_to_rest(graph, self.rig, hold)
+            graph.stop()
+        except BaseException as error:
+            self.rig.stop_quietly()
+            _end(error, graph, recorder, lambda: self._summary(graph, watch))
+            raise
+        # A failure ends without torque, and the log holds it.
+        summary = self._summary(graph, watch)
+        recorder.close("finished", OK, summary, note)
+        return summary
+
+    def _recorder(self, graph: AsyncGraph, state: GraphState, log: Path) -> McapRecorder:
+        """Return the log's writer, whose metadata describes the session; a dry run comes first."""
+        # The graph as the log's metadata describes it.
+        topology = {
+            name: {
+                "rate_hz": node.rate,
+                "delay_s": node.delay,
+                "scheduling": node.scheduling.value,
+                **{k: v for k, v in (("color", node.color), ("order", node.order)) if v is not None},
+                "inputs": {
+                    i: {"from": c.output_node.name, "blocking": c.blocking, "window": c.window, "skip": c.skip}
+                    for i, c in node.inputs.items()
+                },
+            }
+            for name, node in graph.nodes.items()
+        }
+        metadata = {
+            "pipeline": self.robot.name,
+            "dry_run": self.rig.torque_withheld,
+            "config": plain(asdict(self.config)),
+            "graph": topology,
+            "roles": ROLES,
+            "versions": plain(versions()),
+            "git": plain(git_state()),
+            "seed": self.config.seed,
+            "port": self.config.port,
+            "hardware": self.rig.device.facts(),
+        }
+        # The writer, which starts with a mark if the run is dry.
+        inputs = [(n, i) for n, node in graph.nodes.items() for i in node.inputs]
+        joints, units = {SENSOR: self.robot.sensor.joints}, dict.fromkeys(graph.nodes, self.robot.units)
+        recorder = McapRecorder(log, metadata, {}, state.aux["outputs"], inputs, joints, units)
+        if self.rig.torque_withheld:
+            recorder.write_event(
+                "dry run", "torque was withheld: no command in this log was sent, and no motor moved a joint"
+            )
+        return recorder
+
+    def _summary(self, graph: AsyncGraph, watch: Watch) -> dict[str, Any]:
+        # Times of the nodes, in the order of the loop.
+        rig, counters = self.rig, self.rig.device.counters
+        timing = {
+            n: {
+                "steps": s.steps,
+                "period_s": _numbers(s.period_s),
+                "lateness_s": _numbers(s.lateness_s),
+                "overruns": s.overruns,
+                "age_s": {name: _numbers(ages) for name, ages in s.age_s.items()},
+            }
+            for n, s in sorted(graph.statistics().items(), key=lambda item: _place(graph.nodes[item[0]]))
+        }
+        # Counters of bus, gate and commands. `bus`: how long the transactions of each node took, see ``BusUse`` [us];
+        # `late_replies`: answers whose sample's time is not sure, or that came after they had been asked for again;
+        # `late_s`: by how much answers took longer than their bytes, median, 99 % and largest [s].
+        late_s = np.quantile(counters.late_s, [0.5, 0.99, 1.0]).tolist() if counters.late_s.size else [None] * 3
+        uses = {SENSOR: rig.measuring, ACTUATOR: rig.commanding}
+        return {
+            "monotonic_ns": watch.monotonic_ns,
+            "timing": timing,
+            "bus": {
+                name: {kind: values.tolist() for kind, values in asdict(use).items()} for name, use in uses.items()
+            },
+            "transactions": counters.transactions,
+            "lost_replies": counters.lost_replies,
+            "retries": counters.retries,
+            "command_timeouts": rig.timeouts,
+            "late_replies": counters.late_replies,
+            "late_s": late_s,
+            "gate": asdict(rig.gate.counts),
+            "sent": self._sent_rows(watch),
+        }
+
+    def _sent_rows(self, watch: Watch) -> list[dict[str, Any]]:
+        """Return for each motor which commands were sent, or withheld in a dry run: lowest, mean and highest."""
+        field, joints = self.robot.drive.command, self.rig.gate.config.joints
+        several = len(watch.total) > 1
+        return [
+            {
+                "name": joints[i] if i < len(joints) else f"{field}[{i}]" if several else field,
+                "unit": self.robot.units.get(field, ""),
+                "commands": watch.commands,
+                "low": float(watch.low[i]),
+                "mean": float(total) / watch.commands,
+                "high": float(watch.high[i]),
+            }
+            for i, total in enumerate(watch.total if watch.commands else ())
+        ]
+
+
+def _drive(
+    graph: AsyncGraph, state: GraphState, duration_s: float, label: str, recorder: McapRecorder, clock: Clock
+) -> None:
+    """Run the graph; print one warning if the log's writer falls behind."""
+    graph.start(state)
+    with progress(round(duration_s, 1), label) as bar:
+        begin_ns, warned = clock.now_ns(), False
+        while (left := duration_s - 1e-9 * (clock.now_ns() - begin_ns)) > 0:
+            graph.run_for(min(_POLL_S, left))
+            bar.n = round(min(duration_s, 1e-9 * (clock.now_ns() - begin_ns)), 1)
+            bar.refresh()
+            if recorder.behind_s > WARN_BEHIND_S and not warned:
+                note(f"warning: the disk is slow: the log is {recorder.behind_s:.0f} s behind, kept in memory")
+                warned = True
+
+
+def _end(error: BaseException, graph: AsyncGraph, recorder: McapRecorder, summary: Callable[[], Any]) -> None:
+    """Stop the graph and complete the log; what else goes wrong on the way must not take the place of the reason."""
+    status = f"{type(error).__name__}: {error}"
+    with noted(error):
+        graph.stop()
+    with noted(error):
+        recorder.write_event("stop", status)
+    with noted(error):
+        recorder.close(status, _exit_code(error), summary(), note)
+
+
+def come_to_rest(graph: AsyncGraph, rig: Rig, hold: bool) -> None:
+    """Let commands fade, or goals stay, until the robot is at rest; the graph runs on and its log with it.
+
+    Args:
+        hold: Whether to hold it then until Enter is pressed; without a terminal, until a signal comes.
+
+    Raises:
+        Sim2RealError: What stopped the robot meanwhile.
+    """
+    if rig.torque_withheld or not graph.running:
+        return
+    note("coming to rest; Ctrl-C stops at once", urgent=True)
+    rig.ease()
+    while graph.running and not rig.eased:
+        graph.run_for(_REST_POLL_S)
+    if hold:
+        note("holding: support the robot, then press Enter to take the torque off", urgent=True)
+        while graph.running and not _told():
+            graph.run_for(_REST_POLL_S)
+
+
+def _told() -> bool:
+    """Return whether Enter was pressed."""
+    if not sys.stdin.isatty():  # an input that is closed would let go at once
+        return False
+    ready = bool(select.select([sys.stdin], [], [], 0.0)[0])
+    return ready and bool(sys.stdin.readline())
+
+
+def check_deadlines(summary: Mapping[str, Any]) -> None:
+    """Judge an episode for ``--strict-timing``, once everything about it is written."""
+    late = [
+        f"{name} {node['overruns']} of {node['steps']}"
+        for name, node in summary["timing"].items()
+        if node["overruns"] > LATE_SHARE * node["steps"]
+    ]
+    if late:
+        raise DeadlineExceeded(
+            f"more than {LATE_SHARE:.0%} of the steps missed their deadline: {', '.join(late)}",
+            hint="close what else runs on this machine, or lower the rate; the log is complete",
+        )
+
+
+def timing_rows(summary: Mapping[str, Any]) -> tuple[list[list[Any]], list[str]]:
+    """Return the timing table of a summary: rows and headers, times in ms; ages are those of its oldest input."""
+    quantiles = ["p50", "p99", "max [ms]"]
+    headers = ["node", "steps", "period p50", *quantiles[1:], "late p50", *quantiles[1:], "age p50", *quantiles[1:]]
+    rows = []
+    for name, node in summary["timing"].items():
+        ages = [max(q) for q in zip(*node["age_s"].values(), strict=True)] or [None] * 3
+        kinds = (node["period_s"], node["lateness_s"], ages)
+        times = [q if q is None else round(1e3 * q, 2) for kind in kinds for q in kind]
+        rows.append([name, node["steps"], *times, node["overruns"]])
+    if "late_s" in summary:  # the bus: its answers, how late they were, how many too late
+        late = [q if q is None else round(1e3 * q, 2) for q in summary["late_s"]]
+        nothing = [None] * 3
+        rows.append(["answers", summary["transactions"], *nothing, *late, *nothing, summary["late_replies"]])
+    return rows, [*headers, "overruns"]
+
+
+def show_sessions(summaries: Sequence[Mapping[str, Any]], dry_run: bool, embedded: bool) -> None:
+    """Print the timing of the last session and the warnings of all; of a dry run the withheld commands, too."""
+    print(table(*timing_rows(summaries[-1])))
+    for summary in summaries:
+        share = summary["late_replies"] / max(1, summary["transactions"])
+        if share > LATE_SHARE:
+            note(
+                f"warning: {share:.1%} of the answers came late: when those samples were taken is not sure\n"
+                "hint: close what else runs on this computer"
+                + ("" if embedded else ", and set the latency timer of a USB adapter to 1 ms")
+            )
+    if not dry_run:
+        return
+    several = len(summaries) > 1
+    rows = []
+    for number, summary in enumerate(summaries):
+        for s in summary["sent"]:
+            figures = [s["unit"], s["commands"], s["low"], s["mean"], s["high"]]
+            rows.append([*([number] if several else []), s["name"], *figures])
+    heads = ["would have been sent to", "unit", "commands", "min", "mean", "max"]
+    print(table(rows, [*(["episode"] if several else []), *heads]))
+    note("dry run: no joint was moved; no later stage uses this as a recording")
+
+
+def _place(node: BaseNode) -> float:
+    """Return a node's place in tables: nodes with an ``order`` first, the others in the graph's order."""
+    return math.inf if node.order is None else node.order
+
+
+def _numbers(values: Iterable[float]) -> list[float | None]:
+    """Return the values for JSON, which has no NaN: a node without a step has no times."""
+    return [v if math.isfinite(v) else None for v in values]
+
+
+def _exit_code(error: BaseException) -> int:
+    if isinstance(error, Sim2RealError):
+        return error.exit_code
+    if isinstance(error, KeyboardInterrupt):
+        return _INTERRUPTED
+    return error.code if isinstance(error, SystemExit) and isinstance(error.code, int) else ERROR

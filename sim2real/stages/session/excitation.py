@@ -1,0 +1,244 @@
+"""The commands that a recording plays: a generated excitation, or a motion from a file within the robot's limits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sim2real.errors import UsageError
+from sim2real.graph.episode import TICKS_PER_S
+from sim2real.log.importing.importer import import_file
+from sim2real.log.importing.propose import joint_motion
+from sim2real.log.importing.readers import open_tables
+from sim2real.log.reader import read_log
+from sim2real.robots.loop import ACTUATOR, SENSOR
+from sim2real.robots.robot import Robot
+from sim2real.stages.load import mapping_of
+from sim2real.stages.session.config import RecordConfig
+from sim2real.stages.terminal.console import note
+
+_ROUNDED = 1e-6
+"""Excess over a limit that is a rounding error [the command's unit]."""
+
+
+def played(config: RecordConfig, robot: Robot, announce: bool = False) -> np.ndarray:
+    """Return the signal ``(N, commands)`` that ``RobotDrive.around`` makes commands of, one row a step.
+
+    Args:
+        announce: Whether it prints which signals of a file are played, and for how long.
+
+    Raises:
+        UsageError: The robot cannot play it: the frequencies are too high, or a motion leaves its limits.
+    """
+    commands = len(robot.agent.action)
+    if config.standing:
+        if (bent := robot.drive.standing(config.duration_s)) is None:
+            raise UsageError("this robot does not stand on legs", hint="choose another --excitation")
+        return bent
+    if config.motion is None:
+        return excitation(config, robot.rate_hz, commands).reshape(-1, commands)
+    motion = read_motion(config.motion, robot, names_of(config, robot))
+    rows = _within(_sampled(motion, robot.rate_hz, config.duration_s), config, robot)
+    if announce:
+        skipped_s = min(motion.t_s[-1], config.duration_s) - len(rows) / robot.rate_hz
+        note(f"motion: {motion.source}, {len(rows) / robot.rate_hz:.1f} s")
+        if skipped_s > 2.0 / robot.rate_hz:
+            note(f"motion: {skipped_s:.1f} s at its ends are outside of the limits, and are not played")
+    return rows - robot.drive.around(np.zeros((1, commands)))
+
+
+def names_of(config: RecordConfig, robot: Robot) -> tuple[str, ...]:
+    """Return the names of the robot's commands: its joints, otherwise their numbers."""
+    count = len(robot.agent.action)
+    names = robot.drive.gate(config.gate).joints
+    return names if len(names) == count else tuple(f"{robot.drive.command}[{i}]" for i in range(count))
+
+
+def _sampled(motion: FileMotion, rate_hz: float, duration_s: float) -> np.ndarray:
+    """Return a motion at the robot's rate, ``(N, commands)``."""
+    t_s = np.arange(0.0, min(motion.t_s[-1], duration_s), 1.0 / rate_hz)
+    return np.stack([np.interp(t_s, motion.t_s, column) for column in motion.commands.T], axis=1)
+
+
+def _within(rows: np.ndarray, config: RecordConfig, robot: Robot) -> np.ndarray:
+    """Return the motion without its beginning and its end outside the limits, where an arm lies without torque.
+
+    Raises:
+        UsageError: It leaves the limits in between, or is too fast; the robot has not moved.
+    """
+    gate = robot.drive.gate(config.gate)
+    low, high = (np.broadcast_to(np.asarray(end, np.float64), rows.shape[1]) for end in gate.range)
+    low, high = low - _ROUNDED, high + _ROUNDED
+    inside = np.flatnonzero(((rows >= low) & (rows <= high)).all(axis=1))
+    if not inside.size:
+        raise UsageError(
+            f"{config.motion} is outside of the limits everywhere: {_worst(rows, low, high, config, robot)}"
+        )
+    rows = rows[inside[0] : inside[-1] + 1]
+    if ((rows < low) | (rows > high)).any():
+        raise UsageError(
+            f"{config.motion} leaves the robot's limits: {_worst(rows, low, high, config, robot)}",
+            hint="record it again within them; a limit is the smaller one of the robot's and --gate.limit",
+        )
+    speed, unit = np.abs(np.diff(rows, axis=0)) * robot.rate_hz, robot.units[robot.drive.command]
+    most = np.inf if gate.slew_per_s is None else gate.slew_per_s
+    if unit == "rad" and gate.max_speed_rad_s is not None:
+        most = np.minimum(most, gate.max_speed_rad_s)
+    most = np.broadcast_to(most, rows.shape[1])
+    if (speed > most).any():
+        row, column = np.unravel_index((speed - most).argmax(), speed.shape)
+        name = names_of(config, robot)[column]
+        raise UsageError(
+            f"{config.motion} is too fast: {name} moves at {speed[row, column]:.3g} {unit}/s "
+            f"at {row / robot.rate_hz:.2f} s, {most[column]:g} are allowed",
+            hint="move slower; --gate.slew-per-s and --gate.max-speed-rad-s are the limits",
+        )
+    return rows
+
+
+def _worst(rows: np.ndarray, low: np.ndarray, high: np.ndarray, config: RecordConfig, robot: Robot) -> str:
+    """Return the command that is farthest beyond its limits."""
+    beyond = np.maximum(low - rows, rows - high)
+    row, column = np.unravel_index(beyond.argmax(), beyond.shape)
+    name, value, unit = names_of(config, robot)[column], rows[row, column], robot.units[robot.drive.command]
+    return (
+        f"{name} is {value:.3g} {unit} at {row / robot.rate_hz:.2f} s, and must lie in "
+        f"[{low[column]:.3g}, {high[column]:.3g}]"
+    )
+
+
+# -- a motion from a file
+
+_LEAST_S = 1.0
+"""Shortest motion [s]."""
+
+
+@dataclass(frozen=True)
+class FileMotion:
+    """Commands over time.
+
+    Attributes:
+        t_s: Times ``(N,)``, increasing [s].
+        commands: Shape ``(N, commands)`` [the command's unit].
+        source: What of the file it is, for the user.
+    """
+
+    t_s: np.ndarray
+    commands: np.ndarray
+    source: str
+
+
+def read_motion(path: Path, robot: Robot, names: Sequence[str]) -> FileMotion:
+    """Return the motion in a file: goals if it has them, otherwise measured positions.
+
+    A log of this robot, a file that the pipeline's ``import.toml`` maps, or any file that ``sim2real import`` reads
+    whose columns have the names of the robot's joints.
+
+    Args:
+        names: The robot's commands.
+
+    Raises:
+        UsageError: The file has no such motion.
+    """
+    if not path.exists():
+        raise UsageError(f"there is no motion {path}", hint="--excitation FILE is a log, or a csv, npz or parquet file")
+    if path.suffix == ".mcap":
+        motion = _of_log(path, robot)
+    elif (mapping := mapping_of(robot, path)) is not None:
+        episode = import_file(path, mapping)
+        rows = episode.outputs[ACTUATOR][robot.drive.command]
+        motion = FileMotion(episode.steps[ACTUATOR].begun_s, rows, f"{robot.drive.command} of {path.name}")
+    else:
+        motion = FileMotion(*joint_motion(open_tables(path)[0], names, robot.units[robot.drive.command]))
+    return _whole(motion, path, len(names))
+
+
+def _of_log(path: Path, robot: Robot) -> FileMotion:
+    """Return the commands of a log; of one that was guided by hand the measured positions."""
+    episode = read_log(path)
+    sent = episode.outputs.get(ACTUATOR, {}).get(robot.drive.command)
+    if sent is not None and len(sent):
+        return FileMotion(episode.steps[ACTUATOR].end / TICKS_PER_S, sent, f"{robot.drive.command} of {path.name}")
+    field = next((c.position for c in robot.sensor.channels if c.goal == robot.drive.command), None)
+    measured = episode.outputs.get(SENSOR, {}).get(field or "")
+    if measured is None:
+        raise UsageError(
+            f"{path} has no {robot.drive.command!r} of {ACTUATOR!r}",
+            hint="is it a log of this robot? Measured positions are a motion only for position-controlled joints",
+        )
+    return FileMotion(episode.steps[SENSOR].begun_s, measured, f"{field} of {path.name}")
+
+
+def _whole(motion: FileMotion, path: Path, commands: int) -> FileMotion:
+    """Return a motion in the order of time, from time 0.
+
+    Raises:
+        UsageError: It is too short, or has another number of commands.
+    """
+    rows = np.asarray(motion.commands, np.float64).reshape(len(motion.commands), -1)
+    if rows.shape[1] != commands:
+        raise UsageError(f"{path} has {rows.shape[1]} commands for a robot with {commands}")
+    later = np.flatnonzero(np.diff(motion.t_s, prepend=-np.inf) > 0)
+    t_s, rows = motion.t_s[later], rows[later]
+    if len(later) < 2 or t_s[-1] - t_s[0] < _LEAST_S:
+        raise UsageError(f"the motion of {path} is shorter than {_LEAST_S:g} s")
+    if not np.isfinite(rows).all():
+        raise UsageError(f"the motion of {path} holds values that are no numbers")
+    return FileMotion(t_s - t_s[0], rows, motion.source)
+
+
+# -- generated signals
+
+
+def excitation(config: RecordConfig, rate_hz: float, commands: int = 1) -> np.ndarray:
+    """Return the commands of all steps, shape ``(N,)`` for one command, else ``(N, commands)`` [the command's unit].
+
+    ``multisine`` is a sum of twelve sines with random phases between ``low_hz`` and ``high_hz``; ``chirp`` sweeps
+    between these in 10 s, and back; ``steps`` has random levels, each held for half a period of a random frequency
+    between them. All grow from zero during the first 0.5 s and stay within the amplitude. Several commands are
+    independent.
+
+    Args:
+        config: Kind of excitation, duration, amplitude, frequencies and seed.
+        rate_hz: Commands per second [Hz].
+    """
+    if config.high_hz > rate_hz / 2:
+        raise UsageError(
+            f"high_hz = {config.high_hz} Hz is above half the command rate of {rate_hz:g} Hz",
+            hint=f"choose at most {rate_hz / 2:g} Hz",
+        )
+    rng = np.random.default_rng(config.seed)
+    t = np.arange(round(config.duration_s * rate_hz)) / rate_hz
+    make = {"multisine": _multisine, "chirp": _chirp, "steps": _steps}[config.excitation]
+    signals = np.stack([make(t, config.low_hz, config.high_hz, rng) for _ in range(commands)], axis=1)
+    played = config.amplitude * np.clip(signals, -1.0, 1.0) * np.minimum(1.0, t / 0.5)[:, None]
+    return played[:, 0] if commands == 1 else played
+
+
+def _multisine(t: np.ndarray, low_hz: float, high_hz: float, rng: np.random.Generator) -> np.ndarray:
+    lines_hz = np.geomspace(low_hz, high_hz, 12)
+    phases = rng.uniform(0, 2 * np.pi, lines_hz.size)
+    signal = np.sin(2 * np.pi * np.outer(t, lines_hz) + phases).sum(axis=1)
+    # Peaks beyond 2.1 standard deviations are clipped at 1: twice the power of a scaling to 3 standard deviations.
+    return signal / (3 * signal.std() / np.sqrt(2))
+
+
+def _chirp(t: np.ndarray, low_hz: float, high_hz: float, rng: np.random.Generator) -> np.ndarray:
+    sweep = 1.0 - np.abs((t / 10.0) % 2.0 - 1.0)  # 0 to 1 and back in 20 s
+    frequency_hz = low_hz * (high_hz / low_hz) ** sweep
+    step_s = t[1] - t[0]
+    return np.sin(2 * np.pi * np.cumsum(frequency_hz) * step_s + rng.uniform(0, 2 * np.pi))
+
+
+def _steps(t: np.ndarray, low_hz: float, high_hz: float, rng: np.random.Generator) -> np.ndarray:
+    signal = np.empty_like(t)
+    step_s, begin = t[1] - t[0], 0
+    while begin < t.size:
+        hold_s = 0.5 / np.exp(rng.uniform(np.log(low_hz), np.log(high_hz)))
+        end = begin + max(1, round(hold_s / step_s))
+        signal[begin:end] = rng.uniform(-1.0, 1.0)
+        begin = end
+    return signal
