@@ -57,8 +57,8 @@ def make(root: Path) -> Path:
             stage.output(name, path)
     run_dir = stage.run_dir
     with pytest.MonkeyPatch.context() as patch, sketched(pictures=1):
-        patch.setattr(episodes, "opened", lambda *_: nullcontext(Mock()))
-        patch.setattr(episodes, "announce_following", lambda rig: None)
+        patch.setattr(episodes, "opened", lambda robot, config, _: nullcontext(Mock(config=config)))
+        patch.setattr(episodes, "_announce_following", lambda following: None)
         patch.setattr(episodes, "_run_one", lambda *given: deployed(run_dir, *given))
         assert cli.main(["run", "pendulum", "--resume", str(run_dir), "--runs", str(root), *TINY]) == 0
     return run_dir
@@ -66,7 +66,8 @@ def make(root: Path) -> Path:
 
 def deployed(run_dir: Path, *given: Any) -> dict[str, Any]:
     """Run the policy of a run on the simulated robot and write its log; takes what ``episodes._run_one`` takes."""
-    *_, log, config = given
+    bench, *_, log = given
+    config = bench.config
     bundle = Bundle.load(finished(run_dir, "train").output("bundle"))
     played = hidden.play(ROBOT, randomise.controller(bundle, VOLTS), config.duration_s, 1)
     return write(log, log.parent / TRUTH, played)
