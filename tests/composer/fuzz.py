@@ -2,9 +2,9 @@
 
 ``python tests/composer/fuzz.py 0 200`` plays the tasks of seeds 0 to 199, two episodes of each, on dm_control and on C,
 with tendons, pairs, equalities, actuators and sensors across models, whose elements change their names afterwards. With
-``--engine mjx`` it plays them on C and on MJX, from the same random numbers; with ``--engine bare`` on MJX and with
-``mjx.step`` alone, where hooks only set the controls. ``--contacts same`` has contacts that MJX finds as C does,
-``--contacts all`` any; ``--jobs`` is how many processes there are.
+``--engine mjx`` it plays them on C and on MJX, without welds and distances, from the same random numbers; with
+``--engine bare`` on MJX and with ``mjx.step`` alone; hooks then only set controls. ``--contacts same`` has contacts
+that MJX finds as C does, ``--contacts all`` any; ``--jobs`` is how many processes there are.
 """
 
 import argparse
@@ -83,12 +83,12 @@ def play(kit, seed, contacts=None, varied=False, key=0, episodes=1, numbers=0, l
     return found
 
 
-def play_on_mjx(seed, contacts=None, varied=False, keys=(0,)):
+def play_on_mjx(seed, contacts=None, varied=False, keys=(0,), linked=False):
     """Return the streams of a task on MJX, one for each key."""
     import jax
 
     ours = kit("sim2real")
-    task, options = make(ours, seed, contacts, varied)
+    task, options = make(ours, seed, contacts, varied, linked=linked)
     env = ours.composer.MjxEnvironment(task, **options)
     program, actions = jax.jit(_episode(env)), _actions(seed, env.model.nu)
     return [_streams(jax.device_get(program(jax.random.key(key), actions))) for key in keys]
@@ -194,8 +194,8 @@ def compare(seed, contacts=None, engine="dm_control"):
     if engine == "bare":
         return against_bare(seed, contacts)
     if engine == "mjx":
-        mine = play_on_mjx(seed, contacts, True, (0, 1))
-        return max(differ(play(ours, seed, contacts, True, key), m) for key, m in enumerate(mine))
+        mine = play_on_mjx(seed, contacts, True, (0, 1), linked="mjx")
+        return max(differ(play(ours, seed, contacts, True, key, linked="mjx"), m) for key, m in enumerate(mine))
     return differ(*(play(kit(name), seed, contacts, episodes=2, linked=True) for name in ("dm_control", "sim2real")))
 
 

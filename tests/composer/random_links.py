@@ -3,10 +3,12 @@
 import numpy as np
 
 TENDONS = ("fixed", "spatial", "around")
+NOT_ON_MJX = ("weld", "tie", "distance")
+"""What MJX computes otherwise (rows of "Differences from dm_control"), or does not have."""
 KINDS = (*TENDONS, "joint", "weld", "tie", "pair", "exclude", "motor", "frame", "distance", "camera", "material")
 
 
-def link(kit, seed, top, models, contacts, explicit):
+def link(kit, seed, top, models, contacts, explicit, for_mjx):
     """Add some such elements to the models of a world, and call some elements otherwise afterwards.
 
     Args:
@@ -16,6 +18,7 @@ def link(kit, seed, top, models, contacts, explicit):
         models: Those attached to it.
         contacts: Whether geoms of two models may touch.
         explicit: Whether forces may depend on velocities, as in ``random_tasks``.
+        for_mjx: Whether kinds that MJX computes otherwise are left out.
     """
     draw = np.random.RandomState([seed, 7])
     top.worldbody.add("site", name="here", pos=[0.3, 0.2, 1.5])
@@ -23,7 +26,8 @@ def link(kit, seed, top, models, contacts, explicit):
         kind = KINDS[draw.randint(len(KINDS))]
         owner = [top, *models][draw.randint(1 + len(models))]
         by_text = owner is top and draw.rand() < 0.5
-        _add(draw, kind, owner, models, f"x{number}", contacts, explicit, by_text)
+        if not (for_mjx and kind in NOT_ON_MJX):
+            _add(draw, kind, owner, models, f"x{number}", contacts, explicit, by_text)
     for model in [top, *models]:
         model.resolve_references()  # what a program gave as text stays text in dm_control
     for model in models:

@@ -306,7 +306,7 @@ def _entity(kit, model, operator, operations):
     return Robot(model)
 
 
-def _world(kit, draw, contacts, operator, seed=None):
+def _world(kit, draw, contacts, operator, seed=None, for_mjx=False):
     arena, models, entities = kit.composer.Arena(), [], []
     option = arena.mjcf_model.option
     option.noslip_iterations, option.tolerance, option.cone = 0, 1e-14, "pyramidal"
@@ -329,7 +329,8 @@ def _world(kit, draw, contacts, operator, seed=None):
         if contacts == "same" and option.cone == "elliptic" and geom.condim == 1:  # which MJX has no contacts for
             geom.condim = 3
     if seed is not None:
-        random_links.link(kit, seed, arena.mjcf_model, models, contacts, option.integrator != "implicitfast")
+        explicit = option.integrator != "implicitfast"
+        random_links.link(kit, seed, arena.mjcf_model, models, contacts, explicit, for_mjx)
     kinds = ("joint", "site", "geom", "actuator", "sensor", "body", "tendon")
     found = {kind: [e for m in models for e in m.find_all(kind)] for kind in kinds}
     for kind in ("actuator", "sensor", "tendon"):
@@ -350,10 +351,12 @@ def make(kit, seed, contacts=None, varied=False, numbers=0, busy=True, linked=Fa
             and nothing is varied that is also set otherwise, which MJX starts from another value.
         numbers: Seed of the numbers in the model.
         busy: Whether hooks do more than set the controls.
-        linked: Whether there are elements that name elements of other models.
+        linked: Whether there are elements that name elements of other models; "mjx": those that MJX has as C does.
     """
     draw, operator = Draw(seed, numbers), Operator(kit)
-    arena, entities, found, operations = _world(kit, draw, contacts, operator, seed if linked else None)
+    arena, entities, found, operations = _world(
+        kit, draw, contacts, operator, seed if linked else None, linked == "mjx"
+    )
     for own in operations[: len(entities)]:
         own.update(_operations(draw, found, 1 if busy else 0))
     observables = {f"o{i}": _observable(kit, draw, found, varied) for i in range(draw.kinds.randint(2, 6))}

@@ -4,7 +4,7 @@ import pickle
 import mujoco
 import numpy as np
 import pytest
-from composer_parts import ARM
+from composer_parts import ARM, scene
 
 from sim2real.composer import mjcf
 from sim2real.errors import UsageError
@@ -162,3 +162,35 @@ def test_constants_are_computed_anew_without_moving_the_state():
     physics.forward()
     physics.recompute_constants()
     assert physics.data.xpos[1, 2] == 0.5  # what the next step starts from
+
+
+BOUND = [
+    ("joint", "arm/shoulder", "qpos qvel damping range type qpos0 xaxis cdof qposadr limited qfrc_bias"),
+    ("joint", "prop/", "qpos qvel damping"),
+    ("body", "arm/upper", "xpos xmat mass pos inertia xfrc_applied subtreemass weldid"),
+    ("geom", "prop/ball", "xpos xmat size rgba type friction bodyid pos"),
+    ("site", "arm/wrist", "xpos xmat size pos quat"),
+    ("actuator", "arm/shoulder", "ctrl ctrlrange force gear act velocity length"),
+    ("actuator", "arm/hand/bend", "ctrl act gainprm"),
+    ("sensor", "arm/hand/tip", "sensordata adr dim type cutoff"),
+    ("camera", "front", "xpos fovy pos"),
+    ("equality", "arm//unnamed_equality_0", "active data type"),
+]
+
+
+@pytest.mark.parametrize("several", [False, True], ids=["one", "list"])
+@pytest.mark.parametrize(("kind", "name", "attributes"), BOUND, ids=[f"{b[0]}-{b[1]}" for b in BOUND])
+def test_bound_attributes_have_the_same_shape_and_value(oracle, ours, kind, name, attributes, several):
+    values = []
+    for kit in (oracle, ours):
+        root = scene(kit)[0].mjcf_model
+        physics = kit.mjcf.Physics.from_mjcf_model(root)
+        element = next(e for e in root.find_all(kind) if e.full_identifier == name)
+        binding = physics.bind([element] if several else element)
+        values.append(
+            {a: np.array(getattr(binding, a)) for a in attributes.split()} | {"id": np.array(binding.element_id)}
+        )
+    for attribute, value in values[0].items():
+        assert values[1][attribute].shape == value.shape, attribute
+        assert values[1][attribute].dtype == value.dtype, attribute
+        np.testing.assert_array_equal(values[1][attribute], value)

@@ -3,7 +3,7 @@
 import re
 
 import pytest
-from test_oracle import differing_arrays, names
+from random_models import differing_arrays, names
 
 from sim2real.composer import mjcf
 from sim2real.composer.mjcf import schema

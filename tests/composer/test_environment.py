@@ -88,16 +88,6 @@ def test_the_time_limit_counts_steps(limit, control, physics, steps):
     assert step.discount == 1.0
 
 
-def test_failed_resets_are_tried_again_as_often_as_asked():
-    task = Swing(failures=3)
-    env = composer.Environment(task, max_reset_attempts=2)
-    with pytest.raises(composer.EpisodeInitializationError, match="not this time"):
-        env.reset()
-    assert task.attempts == 2
-    assert env.reset().first()
-    assert task.attempts == 4
-
-
 def test_a_failed_reset_inside_step_does_not_run_the_physics_unprepared():
     env = composer.Environment(Swing(failures=1))
     with pytest.raises(composer.EpisodeInitializationError):
@@ -111,14 +101,6 @@ def test_other_errors_are_not_retried():
     env = composer.Environment(task, max_reset_attempts=5)
     with pytest.raises(ZeroDivisionError):
         env.reset()
-
-
-def test_a_fixed_initial_state_draws_the_same_numbers():
-    task = Swing()
-    env = composer.Environment(task, fixed_initial_state=True, random_state=np.random.RandomState(3))
-    assert len({env.reset().observation["angle"].item() for _ in range(3)}) == 1
-    env = composer.Environment(task, random_state=3)
-    assert len({env.reset().observation["angle"].item() for _ in range(3)}) == 3
 
 
 def test_models_are_compiled_anew_at_every_reset_or_only_at_the_first():

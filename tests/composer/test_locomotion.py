@@ -5,7 +5,7 @@ import importlib
 import numpy as np
 import pytest
 from dm_library import Finder
-from test_oracle import differing_arrays
+from random_models import differing_arrays
 
 
 @pytest.fixture(scope="module", autouse=True)

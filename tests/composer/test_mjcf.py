@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import random_models
 from mujoco import mjx
-from test_oracle import names
+from random_models import names
 
 from sim2real import composer
 from sim2real.composer import mjcf

@@ -29,34 +29,6 @@ class Part(composer.Entity):
         return self._model
 
 
-def test_names_are_alphabetical_and_prefixed_below_the_root():
-    root, part = Part("root"), Part()
-    root.attach(part)
-    assert list(root.observables.as_dict()) == ["first", "second"]
-    assert list(part.observables.as_dict()) == ["part/first", "part/second"]
-    assert list(part.observables.as_dict(fully_qualified=False)) == ["first", "second"]
-    assert part.observables.dict_keys.first == "part/first"
-    assert part.observables.get_observable("part/first", name_fully_qualified=True) is part.observables.first
-    assert list(composer.NullTask(root).observables) == ["first", "second", "part/first", "part/second"]
-
-
-def test_options_for_all_or_by_name():
-    everything = {"update_interval": 2, "buffer_size": 10, "delay": 1, "aggregator": "max", "enabled": True}
-    part = Part(observable_options=everything)
-    for value in part.observables.as_dict().values():
-        assert (value.update_interval, value.buffer_size, value.delay, value.enabled) == (2, 10, 1, True)
-        assert value.aggregator is AGGREGATORS["max"]
-    part = Part(observable_options={"first": {"delay": 3}})
-    assert (part.observables.first.delay, part.observables.second.delay) == (3, None)
-    assert (part.observables.second.update_interval, part.observables.second.enabled) == (1, False)
-    with pytest.raises(KeyError, match="No observable with name 'third'"):
-        part.observables.set_options({"third": {}})
-    with pytest.raises(AttributeError, match="Cannot add attribute colour in configure"):
-        part.observables.set_options({"first": {"colour": 2}})
-    with pytest.raises(KeyError, match="Unrecognized aggregator name: 'mode'"):
-        part.observables.first.aggregator = "mode"
-
-
 def test_enabling_and_adding():
     part = Part()
     part.observables.enable_all()

@@ -64,12 +64,6 @@ def test_a_biased_random_walk_has_its_deviation_and_timescale():
             distributions.BiasedRandomWalk(**options)
 
 
-def test_noise_builds_on_the_initial_or_the_current_value():
-    for kind, expected in ((noises.Additive, (12, 102)), (noises.Multiplicative, (20, 200))):
-        fixed, cumulative = kind(deterministic.Constant(2)), kind(deterministic.Constant(2), cumulative=True)
-        assert (fixed(10, 100, None), cumulative(10, 100, None)) == expected
-
-
 @pytest.fixture
 def ball():
     model = mjcf.from_xml_string(
