@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from sim2real import pytree
-from sim2real.composer.physics.mjx import constants, stepping
+from sim2real.composer.physics.mjx import constants
 from sim2real.composer.physics.mjx.environment import MjxEnvironment, State
 from sim2real.composer.physics.mjx.physics import MjxPhysics
 from sim2real.composer.task import Task
@@ -19,13 +19,27 @@ from sim2real.errors import UsageError
 from sim2real.graph.base import Base, GraphState, StepState, Value
 from sim2real.graph.node import BaseWorld
 from sim2real.worlds.recorded import command_delay
-from sim2real.worlds.rollouts import StepLaw, WorldParams
 
 if TYPE_CHECKING:
     from mujoco import mjx
 
     from sim2real.composer.mjcf.element import Elements
     from sim2real.types import PyTree
+
+
+@pytree.dataclass
+class WorldParams(Base):
+    """Parameters that differ from copy to copy.
+
+    Attributes:
+        values: Name -> array, in the unit of the attribute that it sets.
+        qpos: Positions ``(nq,)`` that the task's hooks find at the start [m or rad]; None: the model's.
+        qvel: Velocities ``(nv,)`` at the start [m/s or rad/s]; None: none.
+    """
+
+    values: dict[str, PyTree]
+    qpos: PyTree = None
+    qvel: PyTree = None
 
 
 @pytree.dataclass
@@ -78,8 +92,6 @@ class ComposedWorld(BaseWorld):
             )
         super().__init__(name, ticks, color=color, order=order)
         self.input_name, self.field = command, field
-        self.law: StepLaw | None = None
-        """Sets fields of the model before every physics step from the state; set by a subclass."""
         self._parameters = dict(parameters or {})
         self._derives = any(attribute in CONSTANTS for _, attribute in self._parameters.values())
         # Set the parameters once, to refuse those that cannot vary.
@@ -115,7 +127,7 @@ class ComposedWorld(BaseWorld):
         model = self.environment.model
         qpos = model.qpos0 if params.qpos is None else params.qpos
         qvel = jnp.zeros(model.nv) if params.qvel is None else params.qvel
-        return self.environment.reset(key, self._model(params, starts=True), (qpos, qvel), self._lawful(params))
+        return self.environment.reset(key, self._model(params, starts=True), (qpos, qvel))
 
     def init_delays(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> dict[str, Value]:
         """Return the delay of commands in an episode [s]: `delay` in the parameters of their sender."""
@@ -136,29 +148,12 @@ class ComposedWorld(BaseWorld):
         action = self._action(step_state)
         before = step_state.state
         params = step_state.params
-        state: PyTree = self.environment.step(before, action, self._model(params), self._lawful(params))
+        state: PyTree = self.environment.step(before, action, self._model(params))
         # An episode that has ended stays ended: readers look only now and then.
         truncated = jnp.where(before.done, before.truncated, state.truncated)
         state = state.replace(done=before.done | state.done, truncated=truncated)
         new = step_state.replace(state=state)
         return new, self.output(state)
-
-    def law_values(self, params: WorldParams) -> dict[str, jax.Array]:
-        """Return the numbers that ``law`` needs; they may differ from copy to copy."""
-        del params
-        return {}
-
-    def _lawful(self, params: WorldParams) -> stepping.Law | None:
-        """Return the law as MJX takes it, with the numbers of a copy."""
-        if (law := self.law) is None:
-            return None
-        values = self.law_values(params)
-
-        def lawful(model: mjx.Model, data: mjx.Data) -> mjx.Model:
-            changed = law(jnp, values, data.ctrl, data.qpos, data.qvel)[2]
-            return stepping.with_fields(model, {n: jnp.asarray(v, model.qpos0.dtype) for n, v in changed.items()})
-
-        return lawful
 
     @property
     def has_reward(self) -> bool:

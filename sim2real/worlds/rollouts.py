@@ -1,4 +1,8 @@
-"""Rollouts of many copies of a model on C MuJoCo, on all processors, under controls that are computed beforehand."""
+"""Rollouts of many copies of a model on C MuJoCo, on all processors, under controls that are computed beforehand.
+
+A world whose controls do not depend on its state can have its physics here, outside of a graph's program: it then has
+the methods ``open_loop``, ``fields``, ``start``, ``controls`` and ``message``, see ``MjxWorld``.
+"""
 
 from __future__ import annotations
 
@@ -6,19 +10,16 @@ import copy
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
-from sim2real import pytree
 from sim2real.composer.mjcf.schema import mj
 from sim2real.errors import UsageError
-from sim2real.graph.base import Base, StepState
 
 if TYPE_CHECKING:
     from sim2real.composer.types import Array, ArrayLike, MjModel
-    from sim2real.graph.node import BaseWorld
-    from sim2real.types import PyTree
+    from sim2real.types import PyTree, Scalar
 
 _LARGEST_BYTES = 2**26
 """Most memory for the states of the copies that run at a time."""
@@ -63,21 +64,6 @@ class Start(NamedTuple):
     warmstart: Array
 
 
-@pytree.dataclass
-class WorldParams(Base):
-    """Parameters to identify, or that differ from copy to copy.
-
-    Attributes:
-        values: Name -> array, in the unit of the attribute that it sets.
-        qpos: Positions ``(nq,)`` that the task's hooks find at the start [m or rad]; None: the model's.
-        qvel: Velocities ``(nv,)`` at the start [m/s or rad/s]; None: none.
-    """
-
-    values: dict[str, PyTree]
-    qpos: PyTree = None
-    qvel: PyTree = None
-
-
 class StepLaw(Protocol):
     """Sets controls, forces and fields before every physics step from the state, in MJX and around C."""
 
@@ -112,63 +98,28 @@ class StepLaw(Protocol):
         return self
 
 
-class OpenLoop(Protocol):
-    """A world on MuJoCo whose controls do not depend on its state: its physics can run outside of a graph's program.
+class WornFriction(StepLaw):
+    """Sets dry friction before every step: ``frictionloss * exp(-|velocity| / stribeck_rad_s)`` (Stribeck effect).
 
-    Attributes:
-        substeps: Physics steps in a tick.
-        derives: Whether constants that MuJoCo derives from the model (``mj_setConst``) follow from ``fields``.
+    What MuJoCo's constraint holds at standstill stays exact; only how large it is follows the speed.
     """
 
-    name: str
+    fields: tuple[str, ...] = ("dof_frictionloss",)
+    """Field of the model that it sets, ``(nv,)``."""
 
-    @property
-    def substeps(self) -> int:
-        """See above."""
-        ...
-
-    @property
-    def derives(self) -> bool:
-        """See above."""
-        ...
-
-    def open_loop(self) -> MjModel:
-        """Take the physics out and return the ``MjModel``: from now on ``init_state`` computes nothing with it.
-
-        Raises:
-            UsageError: When the controls, or anything else that is set, depend on the state; or the message on
-                more than positions, velocities and accelerations.
-        """
-
-    def fields(self, params: PyTree, state: PyTree) -> dict[str, Array]:
-        """Return the fields of the model that differ from the compiled one."""
-        ...
-
-    def start(self, params: PyTree, state: PyTree) -> Start:
-        """Return where the physics starts."""
-        ...
-
-    def controls(self, step_state: StepState) -> tuple[StepState, Array]:
-        """Return a tick without its physics: the next step state, and the controls ``(substeps, nu)``."""
-        ...
-
-    def message(self, state: PyTree, qpos: Array, qvel: Array, qacc: Array) -> PyTree:
-        """Return what the world sends.
+    def __call__(
+        self, xp: Any, values: Mapping[str, Scalar], control: PyTree, qpos: PyTree, qvel: PyTree
+    ) -> tuple[PyTree, PyTree, dict[str, PyTree]]:
+        """Return controls ``(..., nu)`` as they are, forces of 0 ``(..., nv)``, and the friction of the next step.
 
         Args:
-            qpos: Positions ``(nq,)`` [m or rad].
-            qvel: Velocities ``(nv,)`` [m/s or rad/s].
-            qacc: Accelerations ``(nv,)`` of the last physics step; at the start those without actuators.
+            values: ``frictionloss`` at standstill [N m] and ``stribeck_rad_s``, where 1/e of it is left, ``(..., nv)``.
+            control: Controls ``(..., nu)``.
+            qvel: Velocities ``(..., nv)`` [rad/s].
         """
-        ...
-
-
-def check_steps(world: BaseWorld, base: type) -> None:
-    """Refuse a world whose class overrides a step or a start: these may depend on the state."""
-    for name in ("step", "init_state", "init_output"):
-        if getattr(type(world), name) is not getattr(base, name):
-            kind = type(world).__name__
-            raise UsageError(f"world {world.name!r}: {kind}.{name} is its own, and may depend on the state")
+        del qpos
+        left = xp.exp(-xp.abs(qvel) / values["stribeck_rad_s"])
+        return control, 0.0 * qvel, {"dof_frictionloss": values["frictionloss"] * left}
 
 
 class Rollouts:

@@ -93,7 +93,7 @@ def test_what_is_over_stays_over(monkeypatch):
     world = composer.ComposedWorld.__new__(composer.ComposedWorld)
     after = State(jnp.array(False), jnp.array(False), jnp.float32(0), {})
     world.environment = SimpleNamespace(step=lambda *_: after)
-    world.input_name, world.field, world.law = "actuator", "action", None
+    world.input_name, world.field = "actuator", "action"
     monkeypatch.setattr(world, "_model", lambda params: None)
     given = {"actuator": SimpleNamespace(data=SimpleNamespace(action=jnp.zeros((1, 1))))}
     for truncated in (False, True):

@@ -49,7 +49,6 @@ def test_a_push_changes_velocities_and_nothing_else():
     np.testing.assert_array_equal(pushed.qpos, state.qpos)
 
 
-@pytest.mark.night
 def test_a_rollout_is_that_of_c_mujoco_under_the_same_commands():
     model = arm()
     world = MjxWorld("world", 100.0, model)

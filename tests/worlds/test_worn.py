@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from sim2real.worlds.rollouts import Rollouts, Start
-from sim2real.worlds.worn import WornFriction
+from sim2real.worlds.rollouts import Rollouts, Start, WornFriction
 
 INERTIA, DAMPING, STEP_S, FAST = 0.01, 0.02, 0.0005, 4.0
 XML = f"""<mujoco><option timestep="{STEP_S}" gravity="0 0 0" integrator="implicitfast"/>

@@ -17,8 +17,7 @@ from sim2real.graph.node import BaseWorld
 from sim2real.robots.loop import ACTUATOR, WORLD, delay_of
 from sim2real.robots.messages import JointReading
 from sim2real.types import MjModel, PyTree
-from sim2real.worlds.rollouts import Start
-from sim2real.worlds.worn import WornFriction
+from sim2real.worlds.rollouts import Start, WornFriction
 
 if TYPE_CHECKING:
     from sim2real.types import Array
@@ -184,7 +183,7 @@ class ServoWorld(BaseWorld):
     def _params(self, graph_state: GraphState | None) -> ServoParams:
         return (graph_state or GraphState()).params.get(self.name) or self.init_params()
 
-    # -- physics that runs elsewhere, see ``worlds.rollouts.OpenLoop``
+    # -- physics that runs elsewhere, see ``worlds.rollouts``
 
     def open_loop(self) -> MjModel:
         """Take the physics out and return the ``MjModel``."""

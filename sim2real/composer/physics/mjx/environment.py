@@ -17,7 +17,7 @@ from sim2real import pytree
 from sim2real.composer.environment import ObservationPadding
 from sim2real.composer.mjcf.schema import mj
 from sim2real.composer.physics.c.physics import Physics
-from sim2real.composer.physics.mjx import gate, stepping
+from sim2real.composer.physics.mjx import gate
 from sim2real.composer.physics.mjx.physics import MjxPhysics, freeze
 from sim2real.composer.physics.mjx.random import JaxRandomState, Registry
 from sim2real.composer.physics.mjx.rings import Ring, Samples
@@ -165,7 +165,6 @@ class MjxEnvironment:
         self,
         state: State | None = None,
         model: mjx.Model | None = None,
-        law: stepping.Law | None = None,
         initial: mjx.Data | None = None,
         dry: bool = False,
     ) -> tuple[MjxPhysics, JaxRandomState]:
@@ -178,8 +177,7 @@ class MjxEnvironment:
         initial = self.initial if initial is None else initial
         compiled = self.mjx_model if model is None else model
         data = initial if state is None else state.data
-        engine = self._warp or stepping.JaxEngine(law)
-        physics = MjxPhysics(self.model, compiled, data, {}, self._legacy, engine)
+        physics = MjxPhysics(self.model, compiled, data, {}, self._legacy, self._warp)
         physics.changed.update(self._changed)  # every copy carries every field that any hook sets
         physics.switch_on()
         physics.start = initial
@@ -221,27 +219,24 @@ class MjxEnvironment:
         key: jax.Array,
         model: mjx.Model | None = None,
         start: tuple[ArrayLike, ArrayLike] | None = None,
-        law: stepping.Law | None = None,
     ) -> State:
         """Return a copy at the start of an episode.
 
         Args:
             model: The ``mjx.Model`` of this copy; default: the compiled one.
             start: Positions ``(nq,)`` and velocities ``(nv,)`` that the hooks find; default: the model's, at rest.
-            law: Sets fields of the model from the state, not on Warp; ``step`` takes the same.
         """
-        return self._reset(key, model, start, law)
+        return self._reset(key, model, start)
 
     def _reset(
         self,
         key: jax.Array,
         model: mjx.Model | None = None,
         start: tuple[ArrayLike, ArrayLike] | None = None,
-        law: stepping.Law | None = None,
         initial: mjx.Data | None = None,
         dry: bool = False,
     ) -> State:
-        physics, random_state = self._physics(None, model, law, initial, dry)
+        physics, random_state = self._physics(None, model, initial, dry)
         random_state.key = key
         if start is not None:
             physics.replace("data", "qpos", start[0])
@@ -265,27 +260,18 @@ class MjxEnvironment:
         outcome = (observation, reward, discount + 1, no, no, failed, terms)
         return State(data, leaves, variables, key, memory, rings, steps, dirty, *outcome)
 
-    def step(
-        self, state: State, action: jax.Array, model: mjx.Model | None = None, law: stepping.Law | None = None
-    ) -> State:
+    def step(self, state: State, action: jax.Array, model: mjx.Model | None = None) -> State:
         """Return the copy one control step later; an episode that is over continues; see ``done``.
 
         Args:
             action: Shape ``(nu,)``, unless the task has an ``action_spec`` of its own.
             model: The ``mjx.Model`` of this copy; default: the compiled one.
         """
-        return self._step(state, action, model, law)
+        return self._step(state, action, model)
 
-    def _step(
-        self,
-        state: State,
-        action: jax.Array,
-        model: mjx.Model | None = None,
-        law: stepping.Law | None = None,
-        dry: bool = False,
-    ) -> State:
+    def _step(self, state: State, action: jax.Array, model: mjx.Model | None = None, dry: bool = False) -> State:
         # Run the hooks and the physics steps.
-        physics, random_state = self._physics(state, model, law, dry=dry)
+        physics, random_state = self._physics(state, model, dry=dry)
         self._hooks.run("before_step", physics, action, random_state)
         rings, diverged = self._substeps(physics, random_state, state, action)
         self._hooks.run("after_step", physics, random_state)

@@ -6,7 +6,6 @@ for a batch or for a derivative. That shortens compilation.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Protocol, TypeVar, cast
 
 import jax
@@ -19,8 +18,6 @@ if TYPE_CHECKING:
     from sim2real.types import PyTree
 
 T = TypeVar("T", mjx.Model, mjx.Data)
-Law = Callable[[mjx.Model, mjx.Data], mjx.Model]
-"""Model and state -> the model with what follows from the state, such as friction that wears off with speed."""
 
 
 def with_fields(tree: T, values: dict[str, PyTree]) -> T:
@@ -46,35 +43,20 @@ class Engine(Protocol):
 
 
 class JaxEngine(Engine):
-    """MJX in JAX.
-
-    Args:
-        law: Sets fields of the model for constraints, from the state that a step begins with.
-    """
-
-    def __init__(self, law: Law | None = None) -> None:
-        self._law = law or _unchanged
+    """MJX in JAX."""
 
     def advance(self, model: mjx.Model, data: mjx.Data, legacy: bool) -> mjx.Data:
-        now = self._law(model, data)
         if not legacy:
-            return _integrate(now, _forward(now, data))
+            return _integrate(model, _forward(model, data))
         # The same stages as without legacy, begun elsewhere (``mj_step2; mj_step1``): it is no dearer.
         rk4 = model.opt.integrator == mjx.IntegratorType.RK4
-        data = _integrate(now, _forward(now, data) if rk4 else _react(now, data))
-        return _positions(self._law(model, data), data)
+        return _positions(model, _integrate(model, _forward(model, data) if rk4 else _react(model, data)))
 
     def forward(self, model: mjx.Model, data: mjx.Data, actuation: bool = True) -> mjx.Data:
-        model = self._law(model, data)
         if not actuation:
             flags = model.opt.disableflags | mjx.DisableBit.ACTUATION
             model = with_fields(model, {"opt.disableflags": flags})
         return _forward(model, data)
-
-
-def _unchanged(model: mjx.Model, data: mjx.Data) -> mjx.Model:
-    del data
-    return model
 
 
 def _forward(model: mjx.Model, data: mjx.Data) -> mjx.Data:
