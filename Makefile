@@ -15,7 +15,7 @@ demo: $(READY)
 
 # The gate. Tests with real processes run alone, one after another; one that fails is repeated once.
 PYTEST := $(BIN)/python -m pytest
-PROCESS := $(PYTEST) -m "process and not night"
+PROCESS := $(PYTEST) $$(grep -rl --include="*.py" mark.process tests) -m "process and not night"
 test: $(READY)
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check

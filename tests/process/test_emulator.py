@@ -3,7 +3,6 @@
 What the servos answer is tested with the same SDK in virtual time, in tests/hardware/test_vendor_sdk.py.
 """
 
-import json
 import os
 import subprocess
 import sys
@@ -15,7 +14,6 @@ from dynamixel_sdk import GroupSyncRead, GroupSyncWrite, PacketHandler, PortHand
 
 from sim2real.emulation.dynamixel import EmulatorConfig
 from sim2real.emulation.process import EmbeddedRobot
-from sim2real.emulation.truth import read_truth
 from sim2real.errors import HardwareLost
 from sim2real.hardware.dynamixel import registers as reg
 
@@ -50,20 +48,6 @@ def test_the_vendors_sdk_reads_and_drives_it(tmp_path, monkeypatch):
         port.closePort()
         assert robot.running
     assert not (tmp_path / "ran").exists()
-
-
-def test_its_first_line_is_the_port_and_sigterm_ends_it(tmp_path):
-    command = [sys.executable, "-m", "sim2real.emulation.process", "--plant", f"{PLANTS}:Ramp"]
-    command += ["--emulation", "sim2real.emulation.dynamixel:EmulatorConfig"]
-    command += ["--truth", tmp_path / "t.bin", "--plant-args", '{"ids": [4]}']
-    process = subprocess.Popen(command, stdout=subprocess.PIPE)
-    ready = json.loads(process.stdout.readline())
-    assert ready["pid"] == process.pid
-    assert Path(ready["port"]).exists()
-    process.terminate()
-    assert process.wait() == 0
-    assert process.stdout.read() == b""
-    assert read_truth(tmp_path / "t.bin").header["servo_ids"] == [4]
     with pytest.raises(HardwareLost, match=r"(?s)has no callable 'Rampp'.*FirstOrder"):
         EmbeddedRobot(f"{PLANTS}:Rampp", EmulatorConfig())
 

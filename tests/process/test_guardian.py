@@ -85,12 +85,6 @@ def assert_off(robot, host):
     return said
 
 
-def test_a_host_that_is_killed(turning):
-    robot, host, _ = turning
-    host.kill()
-    assert "the control process is gone" in assert_off(robot, host)
-
-
 def test_a_host_that_dies_in_the_middle_of_a_packet(turning):
     robot, host, _ = turning
     host.send_signal(signal.SIGUSR1)

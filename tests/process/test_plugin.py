@@ -15,7 +15,7 @@ from sim2real.artifacts.recording import Recording
 from sim2real.emulation.truth import Kind
 from sim2real.hardware.device import OperatingMode
 
-pytestmark = [pytest.mark.process, pytest.mark.timeout(900)]  # a busy machine compiles for minutes
+pytestmark = [pytest.mark.process, pytest.mark.night, pytest.mark.timeout(900)]  # a busy machine compiles for minutes
 
 TESTS = Path(__file__).parents[1]
 IDENTIFY = """
@@ -70,7 +70,6 @@ def test_what_it_brings_has_names(call):
     assert re.search(r"^oiled +entry point turntable.oiled:OiledTable$", said, re.MULTILINE)
 
 
-@pytest.mark.night  # `make test` records it below, and other devices pass the suite in tests/hardware
 def test_its_own_tests_pass(call):
     """They are the conformance suites of devices and robots, and have nothing else."""
     tests = [TESTS / "plugin" / name for name in ("test_odrive.py", "test_turntable.py")]
@@ -88,7 +87,6 @@ def log(call):
     return path
 
 
-@pytest.mark.night
 def test_it_is_recorded_by_its_device(log):
     recording = Recording.load(log)
     assert recording.units == {"position": "rad", "velocity": "rad/s", "goal": "rad/s"}
@@ -99,7 +97,6 @@ def test_it_is_recorded_by_its_device(log):
     assert effects["values"][-1, 0] == OperatingMode.OFF
 
 
-@pytest.mark.night  # `make test` fits it in the plug-in's own tests, above
 def test_it_is_identified_in_a_world_of_its_own(call, log):
     call("-c", IDENTIFY.format(log=str(log)))
     found = Identification.load(call.folder / "found")

@@ -1,16 +1,11 @@
 """A signal that comes where Python drops exceptions must stop the robot all the same."""
 
 import json
-import os
 import signal
 import subprocess
 import sys
-import threading
-import time
 
 import pytest
-
-from sim2real.stages.terminal.interruption import SignalHandling, interruptible, patiently
 
 pytestmark = pytest.mark.process
 
@@ -52,7 +47,10 @@ sys.exit(cli.main(["record", "pendulum"]))
 """
 
 
-@pytest.mark.parametrize(("number", "code", "by_collector"), [(signal.SIGINT, 130, False), (signal.SIGTERM, 143, True)])
+@pytest.mark.parametrize(
+    ("number", "code", "by_collector"),
+    [pytest.param(signal.SIGINT, 130, False, marks=pytest.mark.night), (signal.SIGTERM, 143, True)],
+)
 def test_a_signal_inside_a_finaliser_is_not_lost(tmp_path, number, code, by_collector):
     process = subprocess.Popen(
         [sys.executable, "-c", FINALISER.replace("{by_collector}", str(by_collector))],
@@ -68,55 +66,6 @@ def test_a_signal_inside_a_finaliser_is_not_lost(tmp_path, number, code, by_coll
     assert process.returncode == code
     assert "torque off" in out
     assert "Traceback" not in err
-
-
-SLEEPER = """
-import sys, time
-from pathlib import Path
-from types import ModuleType
-from sim2real import cli
-from sim2real.artifacts import run as run_folder
-
-def run(pipeline, config, root, run_dir):
-    with run_folder.open_stage(root, pipeline.name, "record", config) as stage:
-        try:
-            print("started", flush=True)
-            for _ in range(300):  # a signal between the print and a sleep does not end that sleep
-                time.sleep(0.1)
-        finally:
-            print("torque off", flush=True)
-            time.sleep(0.3)
-            print("log closed", flush=True)
-
-module = ModuleType("sim2real.stages.session.record")
-module.run = run
-sys.modules[module.__name__] = module
-sys.exit(cli.main(["record", "pendulum"]))
-"""
-
-
-def test_a_signal_unwinds_once_and_gives_its_code(tmp_path):
-    """Here the end of a terminal; Ctrl-C and SIGTERM end stages in test_stages.py."""
-    number, code = signal.SIGHUP, 129
-    process = subprocess.Popen(
-        [sys.executable, "-c", SLEEPER],
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    assert process.stdout is not None
-    assert process.stdout.readline() == "started\n"
-    process.send_signal(number)
-    assert process.stdout.readline() == "torque off\n"
-    process.send_signal(number)  # the second one must not break off the clean-up
-    out, err = process.communicate()
-    assert process.returncode == code
-    assert out == "log closed\n"
-    assert "still cleaning up" in err
-    (manifest,) = tmp_path.glob("runs/pendulum/*/record/manifest.json")
-    manifest = json.loads(manifest.read_text())
-    assert (manifest["status"], manifest["exit_code"]) == ("interrupted", code)
 
 
 AT_WORK = """
@@ -142,6 +91,7 @@ sys.exit(cli.main())
 """
 
 
+@pytest.mark.night
 def test_a_command_that_is_interrupted_while_xla_is_at_work_ends_in_order(tmp_path):
     process = subprocess.Popen(
         [sys.executable, "-c", AT_WORK], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -157,40 +107,3 @@ def test_a_command_that_is_interrupted_while_xla_is_at_work_ends_in_order(tmp_pa
     assert err == "interrupted\n"
     (manifest,) = tmp_path.glob("runs/pendulum/*/train/manifest.json")
     assert json.loads(manifest.read_text())["status"] == "interrupted"
-
-
-def test_a_signal_does_not_wait_for_a_long_computation():
-    def compile_for_a_minute():
-        threading.Timer(0.1, os.kill, [os.getpid(), signal.SIGINT]).start()
-        forever.wait(60)
-
-    forever = threading.Event()
-    with SignalHandling(), pytest.raises(KeyboardInterrupt):
-        patiently(compile_for_a_minute)
-    forever.set()
-
-
-def test_what_a_computation_returns_and_raises_comes_back():
-    assert patiently(lambda: 3) == 3
-    with pytest.raises(ZeroDivisionError):
-        patiently(lambda: 1 // 0)
-
-
-def stopped_twice():
-    """Be told to stop, and again while coming to rest."""
-    try:
-        os.kill(os.getpid(), signal.SIGINT)
-        time.sleep(60)
-    except KeyboardInterrupt:
-        with interruptible():
-            os.kill(os.getpid(), signal.SIGTERM)
-            time.sleep(60)
-
-
-def test_a_second_signal_ends_a_soft_stop_at_once_and_a_third_changes_nothing(capfd):
-    with SignalHandling():
-        with pytest.raises(SystemExit):
-            stopped_twice()
-        os.kill(os.getpid(), signal.SIGINT)
-        time.sleep(0.05)
-    assert "still cleaning up" in capfd.readouterr().err

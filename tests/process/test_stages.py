@@ -59,6 +59,7 @@ def test_sigterm_ends_a_deployment_in_order(tmp_path, start_cli):
     assert_ended_in_order(log.parent, log, 143)
 
 
+@pytest.mark.night
 def test_a_killed_recording_leaves_what_was_written(tmp_path, lone_robot, start_cli):
     """How much is lost at most is tested for the log's writer, in tests/log/test_log_damage.py."""
     port, end_robot = lone_robot
@@ -133,6 +134,7 @@ def test_a_viewer_that_is_killed_costs_no_row(tmp_path, capsys):
     assert viewers() == []
 
 
+@pytest.mark.night
 def test_a_robot_is_recorded_and_moved_by_a_policy_without_jax(tmp_path):
     without_jax = Path(__file__).parents[1] / "stages" / "without_jax.py"
 

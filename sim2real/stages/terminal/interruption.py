@@ -62,10 +62,15 @@ class SignalHandling:
             signal.signal(number, old)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        del frame
         if self._raised is not None and not _soft.is_set():
             os.write(2, b"still cleaning up\n")  # print() is not safe inside a signal handler
             return
+        # Python ignores an exception in the hook, too: wait until the hook has returned.
+        while frame is not None:
+            if frame.f_code is SignalHandling._dropped.__code__:
+                self._send_later(number)
+                return
+            frame = frame.f_back
         _soft.clear()
         self.received = number
         self._raised = KeyboardInterrupt() if number == signal.SIGINT else SystemExit(128 + number)
@@ -76,8 +81,10 @@ class SignalHandling:
             self._hook(unraisable)
             return
         self._raised = None
-        # Sent a moment later: before this hook returns, the exception would be ignored again.
-        threading.Timer(0.01, os.kill, (os.getpid(), self.received)).start()
+        self._send_later(self.received)
+
+    def _send_later(self, number: int) -> None:
+        threading.Timer(0.01, os.kill, (os.getpid(), number)).start()
 
 
 def patiently(work: Callable[[], Result]) -> Result:
