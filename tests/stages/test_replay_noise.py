@@ -15,7 +15,7 @@ def test_a_prediction_that_diverges_is_infinitely_wrong(monkeypatch, errors, lim
     left = iter(errors)
     monkeypatch.setattr(replay.prediction, "samples", lambda *_: {})
     monkeypatch.setattr(
-        replay.prediction, "errors", lambda *_: [Prediction("identified", 1.0, True, {"th": next(left)}, {})]
+        replay.prediction, "errors", lambda *_: [Prediction("identified", 1.0, True, {"th": next(left)})]
     )
     problem = SimpleNamespace(ts=np.zeros((1, 3)), segments=1, readings={"th": np.zeros((1, 3))})
     problem.with_readings = lambda readings: problem
