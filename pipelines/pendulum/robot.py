@@ -28,7 +28,7 @@ from .model import HISTORY, Agent, Command, Measurement, PendulumParams, Pendulu
 
 if TYPE_CHECKING:
     from sim2real.hardware.device import Reading
-    from sim2real.hardware.dynamixel.device import DynamixelServos
+    from sim2real.hardware.dynamixel import DynamixelServos
     from sim2real.hardware.joint import Joint
     from sim2real.hardware.safety.following import Following
     from sim2real.hardware.safety.gate import GateConfig
@@ -105,9 +105,8 @@ class HingeDrive(RobotDrive):
 
     def make_device(self, port: str, silence_s: float) -> DynamixelServos:
         """Return the servo on a port, not opened yet; ``silence_s``: longest silence while torque is on [s]."""
-        from sim2real.hardware.dynamixel.bus import BusConfig
-        from sim2real.hardware.dynamixel.device import DynamixelServos
-        from sim2real.hardware.dynamixel.drive import VoltageDrive
+        from sim2real.hardware.bus.port import BusConfig
+        from sim2real.hardware.dynamixel import DynamixelServos, VoltageDrive
 
         from .plant import SUPPLY_V
 

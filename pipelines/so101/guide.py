@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sim2real.hardware.feetech.calibration import CalibratedJoint
-from sim2real.hardware.feetech.hand_motion import Nudge
+from sim2real.hardware.bus.servos import ServoJoint
+from sim2real.hardware.hand_motion import Nudge
 
 from .robot import JOINTS, SERVOS, TRAVEL_RAD, SO101Robot, calibrations, read
 
@@ -29,7 +29,7 @@ def robot(calibration: Path) -> SO101Robot:
     return SO101Robot(calibration=calibration)
 
 
-def calibration_of(joints: tuple[CalibratedJoint, ...]) -> Path | None:
+def calibration_of(joints: tuple[ServoJoint, ...]) -> Path | None:
     """Return LeRobot's calibration of the arm with these servos; None: there is no calibration at all.
 
     Of several files, it is the one with the homing offsets of the servos.

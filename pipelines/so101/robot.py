@@ -29,8 +29,8 @@ from sim2real.robots.session import Embedded
 from sim2real.types import Array, Key
 
 if TYPE_CHECKING:
-    from sim2real.hardware.feetech.calibration import CalibratedJoint
-    from sim2real.hardware.feetech.drive import StsDrive
+    from sim2real.hardware.bus.servos import ServoJoint
+    from sim2real.hardware.feetech import StsDrive
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 """LeRobot's names, in the order of the servos' ids."""
@@ -214,13 +214,13 @@ def score(t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float]
     }
 
 
-def read(path: Path) -> tuple[CalibratedJoint, ...]:
+def read(path: Path) -> tuple[ServoJoint, ...]:
     """Return the joints of LeRobot's calibration file, in the order of the arm.
 
     Raises:
         UsageError: It is no calibration of an SO-101, or the range of a joint with stops is far from its travel.
     """
-    from sim2real.hardware.feetech.calibration import read_calibration
+    from sim2real.hardware.calibration import read_calibration
 
     joints = {joint.name: joint for joint in read_calibration(path, TRAVEL_RAD)}
     if lacking := [name for name in JOINTS if name not in joints]:

@@ -233,10 +233,10 @@ def calibrate(port: str, guide: Any, path: Path) -> None:
         UsageError: LeRobot's file is refused.
         HardwareLost: A servo or the motion contradicts the calibration. No motor has moved.
     """
-    from sim2real.hardware.feetech.calibrate import follow, write_calibration
-    from sim2real.hardware.feetech.device import StsConfig, StsServos
-    from sim2real.hardware.feetech.find_servos import find_servos
-    from sim2real.hardware.feetech.hand_motion import HandMotion
+    from sim2real.hardware.bus.port import BusConfig
+    from sim2real.hardware.calibration import find_servos, follow, write_calibration
+    from sim2real.hardware.feetech import StsServos
+    from sim2real.hardware.hand_motion import HandMotion
     from sim2real.stages.terminal.console import note
 
     # Find the servos, and the file that belongs to them.
@@ -246,7 +246,7 @@ def calibrate(port: str, guide: Any, path: Path) -> None:
     joints = present if source is None else guide.read(source)
     note(f"calibration: {source or 'none of LeRobot, so it is made now'}", urgent=True)
     # Opening compares models, homing offsets and limits with the calibration, and takes the torque off.
-    with StsServos(StsConfig(port, guide.BAUD_RATE, max_silence_s=_SILENCE_S), joints) as servos:
+    with StsServos(BusConfig(port, guide.BAUD_RATE, max_silence_s=_SILENCE_S), joints) as servos:
         motion = HandMotion(joints, guide.NUDGES, calibrated=source is not None)
         note(f"torque is off. Move the arm by hand. Its middle pose: {guide.MIDDLE}", urgent=True)
         follow(servos, motion, lambda words: note(f"- {words}", urgent=True))

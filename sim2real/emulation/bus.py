@@ -17,11 +17,11 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Final, Generic, Protocol, TypeVar
 
 from sim2real.emulation.faults import Emulation, FaultTimes
-from sim2real.emulation.firmware import Firmware, ServoFirmware
+from sim2real.emulation.firmware import ServoFirmware
 from sim2real.emulation.plant import Plant, PlantClock
 from sim2real.emulation.truth import Kind, TruthLog
-from sim2real.hardware.bus.packets import BROADCAST_ID, Instruction, PacketFormat, Parser
-from sim2real.hardware.bus.registers import Register
+from sim2real.hardware.bus.packets import BROADCAST_ID, Instruction, Parser
+from sim2real.hardware.bus.registers import Family
 from sim2real.hardware.device import OperatingMode
 
 
@@ -96,6 +96,21 @@ class Request:
     t_ns: int
     t_host_ns: int
     actuation_ns: int | None = None
+
+
+class Firmware(Protocol):
+    """Registers and firmware of one servo, as far as `PlannedBus` needs them; see `ServoFirmware` for the methods."""
+
+    servo_id: int
+    heard_ns: int
+    watchdog_stops: bool
+
+    def command(self) -> tuple[int, float]: ...
+    def controller(self) -> tuple[int, int, float]: ...
+    def refresh(self, position_rad: float, velocity_rad_s: float, load: float, tick_ms: int) -> None: ...
+    def watchdog_deadline_ns(self) -> int | None: ...
+    def trip_watchdog(self) -> None: ...
+    def overload(self) -> None: ...
 
 
 class PacketParser(Protocol):
@@ -332,12 +347,10 @@ class InstructedBus(PlannedBus, Generic[S, E]):
         start_ns: Time 0 of the plant.
 
     Attributes:
-        present: The first and the last register of present values.
         wild_counts: Range of positions out of the motors' reach.
     """
 
-    form: ClassVar[PacketFormat]
-    present: ClassVar[tuple[Register, Register]]
+    family: ClassVar[Family]
     wild_counts: ClassVar[tuple[int, int]]
 
     def __init__(
@@ -349,7 +362,7 @@ class InstructedBus(PlannedBus, Generic[S, E]):
         start_ns: int,
         now_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        self.config = config
+        self.config, self.form = config, self.family.form
         self.servos = {i: self.make_servo(i) for i in sorted(plant.servo_ids)}
         self._handlers: dict[int, Callable[[Request, list[S]], None]] = {
             Instruction.PING: self._ping,
@@ -413,11 +426,11 @@ class InstructedBus(PlannedBus, Generic[S, E]):
         length = self.form.word(request.packet.parameters, position + self.form.address_bytes)
         sample = self.measure(servo, request.t_ns)
         if self.ill(self._config.wild, request.t_ns):
-            servo.put(servo.table.position, self.random.randrange(*self.wild_counts))
+            servo.put(self.family.position, self.random.randrange(*self.wild_counts))
         error, data = servo.read(address, length)
         if servo.answers_reads:
-            first, last = self.present
-            measured = address < last.end and address + length > first.address
+            present = self.family.position, self.family.velocity, self.family.load
+            measured = any(address < r.end and address + length > r.address for r in present)
             self._answer(servo, request, error, data, sample if measured else None)
 
     def _read(self, request: Request, targets: list[S]) -> None:

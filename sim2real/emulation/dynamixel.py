@@ -1,24 +1,20 @@
-"""Emulated DYNAMIXEL X servos: their registers and firmware, and their bus."""
+"""Emulated DYNAMIXEL X servos: what their firmware adds to the table, and their bus."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any, Final
 
 from sim2real.emulation.bus import BusEmulation, InstructedBus, Request
 from sim2real.emulation.firmware import ServoFirmware
+from sim2real.hardware import dynamixel as reg
 from sim2real.hardware.bus.packets import Instruction
 from sim2real.hardware.bus.registers import Register
 from sim2real.hardware.device import OperatingMode
-from sim2real.hardware.dynamixel import registers as reg
-from sim2real.hardware.dynamixel.models import model
-from sim2real.hardware.dynamixel.protocol import ALERT_BIT, PROTOCOL, StatusError
+from sim2real.hardware.dynamixel import ALERT_BIT, StatusError
 
 _MOVING_THRESHOLD_COUNT: Final = 10
 _OVERLOAD_BIT: Final = 5
-_FIXED: Final = (reg.ID, reg.BAUD_RATE, reg.DRIVE_MODE)
-_MOTION: Final = (reg.TORQUE_ENABLE, *reg.TABLE.goals)
 
 
 class EmulatedServo(ServoFirmware):
@@ -28,7 +24,10 @@ class EmulatedServo(ServoFirmware):
         watchdog_stops: Whether a tripped bus watchdog stops the motor; None: as in the model's firmware.
     """
 
-    table = reg.TABLE
+    family = reg.FAMILY
+    fixed = (reg.ID, reg.BAUD_RATE, reg.DRIVE_MODE)
+    homing = reg.HOMING_OFFSET
+    atomic = True
 
     def __init__(
         self,
@@ -39,7 +38,7 @@ class EmulatedServo(ServoFirmware):
         watchdog_stops: bool | None = None,
     ) -> None:
         super().__init__(servo_id, model_number, return_delay_us, encoder_counts)
-        self.watchdog_stops = bool(model(model_number).stops_alone) if watchdog_stops is None else watchdog_stops
+        self.watchdog_stops = bool(reg.model(model_number).stops_alone) if watchdog_stops is None else watchdog_stops
 
     @property
     def answers_reads(self) -> bool:
@@ -61,121 +60,67 @@ class EmulatedServo(ServoFirmware):
         """The alert bit of status packets: 0x80 while a hardware error is present, else 0."""
         return ALERT_BIT if self.get(reg.HARDWARE_ERROR_STATUS) else 0
 
-    def command(self) -> tuple[int, float]:
-        """Return mode and goal: PWM and a fraction in [-1, 1], POSITION [rad], VELOCITY [rad/s], or OFF and 0."""
-        # Torque off and a tripped watchdog come before the operating mode.
-        if not self.get(reg.TORQUE_ENABLE):
-            return OperatingMode.OFF, 0.0
+    def driven(self) -> tuple[int, float]:
+        """Return PWM and a fraction in [-1, 1], POSITION [rad], or VELOCITY [rad/s]."""
         mode = self.get(reg.OPERATING_MODE)
-        if self.watchdog_stops and self.get(reg.BUS_WATCHDOG) == reg.WATCHDOG_TRIPPED:
+        if self.watchdog_stops and self.get(reg.BUS_WATCHDOG) < 0:
             return OperatingMode.PWM, 0.0
-        if mode == OperatingMode.PWM:
-            return mode, reg.fraction_from_pwm(self.get(reg.GOAL_PWM))
-        if mode == OperatingMode.VELOCITY:
-            return mode, reg.rad_s_from_count(self.get(reg.GOAL_VELOCITY))
-        goal_count = self.get(reg.GOAL_POSITION) - self.get(reg.HOMING_OFFSET)
-        return OperatingMode.POSITION, reg.rad_from_count(goal_count)
+        if mode in (OperatingMode.PWM, OperatingMode.VELOCITY):
+            goal = reg.GOAL_PWM if mode == OperatingMode.PWM else reg.GOAL_VELOCITY
+            return mode, self.get(goal) * goal.unit
+        return super().driven()
 
-    def controller(self) -> tuple[int, int, float]:
-        """Return P gain and D gain of the position controller [counts], and its profile velocity [rad/s]."""
-        count = self.get(reg.PROFILE_VELOCITY)
-        profile_velocity_rad_s = reg.rad_s_from_count(count) if count else math.inf
-        return self.get(reg.POSITION_P_GAIN), self.get(reg.POSITION_D_GAIN), profile_velocity_rad_s
-
-    def refresh(self, position_rad: float, velocity_rad_s: float, load: float, tick_ms: int) -> None:
-        """Set the Present registers from a measurement of the plant.
-
-        Args:
-            position_rad: Angle from the encoder's zero [rad].
-            load: Fraction of the largest load, in [-1, 1].
-            tick_ms: Time since power-up [ms]; wraps at 32768 like the servo's own counter.
-        """
-        # Round the angle to the encoder's resolution, then to counts of the register.
-        step_rad = 2.0 * math.pi / self._encoder_counts
-        count = reg.count_from_rad(round(position_rad / step_rad) * step_rad)
-        velocity_count = reg.count_from_rad_s(velocity_rad_s)
+    def refresh(self, position_rad: float, velocity_rad_s: float, load: float, tick_ms: int = 0) -> None:
+        """Set the registers of present values; the tick wraps at 32768 like the servo's own counter."""
+        super().refresh(position_rad, velocity_rad_s, load)
         mode, goal = self.command()
-        self.put(reg.PRESENT_POSITION, count + self.get(reg.HOMING_OFFSET))
-        self.put(reg.PRESENT_VELOCITY, velocity_count)
-        self.put(reg.PRESENT_LOAD, round(max(-1.0, min(1.0, load)) * reg.LOAD_FULL_SCALE))
-        self.put(reg.PRESENT_PWM, reg.pwm_from_fraction(goal) if mode == OperatingMode.PWM else 0)
-        self.put(reg.MOVING, abs(velocity_count) > _MOVING_THRESHOLD_COUNT)
+        self.put(reg.PRESENT_PWM, reg.GOAL_PWM.count(goal) if mode == OperatingMode.PWM else 0)
+        self.put(reg.MOVING, abs(self.get(reg.PRESENT_VELOCITY)) > _MOVING_THRESHOLD_COUNT)
         self.put(reg.REALTIME_TICK, tick_ms % 32768)
 
-    def read(self, address: int, length: int) -> tuple[StatusError, bytes]:
+    def read(self, address: int, length: int) -> tuple[int, bytes]:
         """Return the error and the bytes of the answer to a READ."""
-        if length == 0 or address + length > reg.TABLE.size:
+        if length == 0 or address + length > self.family.size:
             return StatusError.ACCESS, b""
         return StatusError.NONE, bytes(self._memory[address : address + length])
 
-    def write(self, address: int, data: bytes) -> tuple[StatusError, bool]:
-        """Write all registers, or none if there is an error; return it, and whether `command` may have changed."""
-        # Check every register before the first is written.
-        pairs: list[tuple[Register, int]] = []
-        error = self._split(address, data, pairs)
-        for register, value in pairs:
-            error = error or self._refusal(register, value)
-        if error:
-            return error, False
-        # When torque goes on, the goals are set to rest.
-        torque_was_on = self.get(reg.TORQUE_ENABLE)
-        for register, value in pairs:
-            self.put(register, value)
-        torque_on = self.get(reg.TORQUE_ENABLE)
-        if torque_on and not torque_was_on:
-            self._rest_goals()
-        moves = any(register in _MOTION for register, _ in pairs) and bool(torque_on or torque_was_on)
-        return StatusError.NONE, moves
-
-    def action(self) -> tuple[StatusError, bool]:
+    def action(self) -> tuple[int, bool]:
         """Carry out the stored write; without one, the result is an instruction error."""
-        if self._registered is None:
-            return StatusError.INSTRUCTION, False
-        stored, self._registered = self._registered, None
-        return self.write(*stored)
-
-    def watchdog_deadline_ns(self) -> int | None:
-        """Return the time at which the bus watchdog trips without an instruction; None if it is off."""
-        value = self.get(reg.BUS_WATCHDOG)
-        if value <= 0 or not self.get(reg.TORQUE_ENABLE):
-            return None
-        return self.heard_ns + round(value * reg.WATCHDOG_UNIT_S * 1e9)
+        return (StatusError.INSTRUCTION, False) if self._registered is None else super().action()
 
     def trip_watchdog(self) -> None:
         """Trip the bus watchdog: it refuses goals until it is set to 0, and the motor stops on some models."""
         if self.watchdog_stops:
-            self._rest_goals()
-        self.put(reg.BUS_WATCHDOG, reg.WATCHDOG_TRIPPED)
+            self.switched_on()
+        self.put(reg.BUS_WATCHDOG, -1)
 
     def overload(self) -> None:
         """Shut down as after an overload: torque off, and an error bit set until reboot."""
         self.put(reg.HARDWARE_ERROR_STATUS, 1 << _OVERLOAD_BIT)
-        self.put(reg.TORQUE_ENABLE, 0)
+        super().overload()
 
-    def _rest_goals(self) -> None:
+    def switched_on(self) -> None:
+        """Set the goals to rest."""
         self.put(reg.GOAL_PWM, 0)
         self.put(reg.GOAL_VELOCITY, 0)
         self.put(reg.GOAL_POSITION, self.get(reg.PRESENT_POSITION))
 
-    def _split(self, address: int, data: bytes, pairs: list[tuple[Register, int]]) -> StatusError:
-        """Split written bytes into whole registers and append these to `pairs`."""
+    def misfit(self, address: int, data: bytes, whole: list[Register]) -> int:
+        """Return the error for data that are not whole registers in a row."""
         if not data:
             return StatusError.DATA_LENGTH
-        while data:
-            register = reg.TABLE.registers.get(address)
-            if register is None:
+        for register in whole:
+            if register.address != address:
                 return StatusError.ACCESS
-            if len(data) < register.size:
-                return StatusError.DATA_LENGTH
-            pairs.append((register, register.decode(data[: register.size])))
             address, data = register.end, data[register.size :]
-        return StatusError.NONE
+        cut = self.family.registers.get(address) if data else None
+        return StatusError.NONE if not data else StatusError.DATA_LENGTH if cut else StatusError.ACCESS
 
-    def _refusal(self, register: Register, value: int) -> StatusError:
+    def refusal(self, register: Register, value: int) -> int:
         """Return the firmware's reason to refuse a value, or NONE."""
         if not register.writable or (register.eeprom and self.get(reg.TORQUE_ENABLE)):
             return StatusError.ACCESS
-        if register in _FIXED and value != self.get(register):
+        if register in self.fixed and value != self.get(register):
             return StatusError.RESULT_FAIL  # not emulated: other ids, baud rates and drive modes
         if register == reg.TORQUE_ENABLE and value and self.alert:
             return StatusError.RESULT_FAIL  # after a shutdown, torque can be switched on only after a reboot
@@ -183,7 +128,7 @@ class EmulatedServo(ServoFirmware):
             return StatusError.DATA_RANGE
         if register == reg.OPERATING_MODE and value not in list(OperatingMode)[1:]:
             return StatusError.DATA_RANGE
-        if register in reg.TABLE.goals and self.get(reg.BUS_WATCHDOG) == reg.WATCHDOG_TRIPPED:
+        if register in self.family.goals and self.get(reg.BUS_WATCHDOG) < 0:
             # e-Manual, Bus Watchdog(98): goals become read-only, and writing them gives a range error.
             return StatusError.DATA_RANGE
         return StatusError.DATA_LIMIT if self._beyond_limit(register, value) else StatusError.NONE
@@ -201,8 +146,7 @@ class EmulatedServo(ServoFirmware):
 class EmulatedBus(InstructedBus[EmulatedServo, "EmulatorConfig"]):
     """Emulated DYNAMIXEL servos on a bus, driving a plant; see `InstructedBus`."""
 
-    form = PROTOCOL
-    present = (reg.PRESENT_PWM, reg.PRESENT_POSITION)
+    family = reg.FAMILY
     wild_counts = (1 << 24, 1 << 31)
 
     def __init__(self, *arguments: Any) -> None:

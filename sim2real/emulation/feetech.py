@@ -9,10 +9,9 @@ from typing import Any, Final
 from sim2real.emulation.bus import BusEmulation, Firmware, InstructedBus, Request
 from sim2real.emulation.firmware import ServoFirmware
 from sim2real.emulation.plant import ConfigurablePlant, Plant
-from sim2real.errors import UsageError
+from sim2real.hardware import feetech as reg
+from sim2real.hardware.bus.registers import Register
 from sim2real.hardware.device import OperatingMode
-from sim2real.hardware.feetech import registers as reg
-from sim2real.hardware.feetech.protocol import PROTOCOL
 
 
 @dataclass
@@ -101,12 +100,10 @@ class ProfiledPlant:
 
 STALL_CURRENT_A: Final = 2.7  # data sheet of the STS3215-C018, 12 V
 _MOVING_COUNTS_PER_S: Final = 50
-_FIXED: Final = (reg.ID, reg.BAUD_RATE)
-_MOTION: Final = (reg.TORQUE_ENABLE, *reg.TABLE.goals, reg.OPERATING_MODE)
 
 
 class StsServo(ServoFirmware):
-    """Registers and firmware of one STS3215, without time, bus and physics.
+    """Registers and firmware of one STS3215; see `ServoFirmware`.
 
     A value out of range is dropped without an error, as its status packets carry none; so is a write to a read-only
     register. EEPROM registers accept writes at any time; a value that was written while Lock is 1 is lost at the next
@@ -121,7 +118,10 @@ class StsServo(ServoFirmware):
         alarms: The alarms that `overload` sets; bits of the error byte.
     """
 
-    table = reg.TABLE
+    family = reg.FAMILY
+    fixed = (reg.ID, reg.BAUD_RATE)
+    homing = reg.HOMING_OFFSET
+    offset_sign = -1
 
     def __init__(
         self,
@@ -148,9 +148,11 @@ class StsServo(ServoFirmware):
         return self.get(reg.STATUS)
 
     def command(self) -> tuple[int, float]:
-        """Return mode and goal of the motor; see `Firmware.command`."""
-        if not self.get(reg.TORQUE_ENABLE) or self.alert & self.get(reg.UNLOADING):
-            return OperatingMode.OFF, 0.0
+        """Return mode and goal of the motor, which is off after some alarms."""
+        return (OperatingMode.OFF, 0.0) if self.alert & self.get(reg.UNLOADING) else super().command()
+
+    def driven(self) -> tuple[int, float]:
+        """Return PWM and a fraction in [-1, 1], POSITION [rad], or VELOCITY [rad/s]."""
         mode = self.get(reg.OPERATING_MODE)
         if mode == reg.Mode.PWM:
             return OperatingMode.PWM, self.get(reg.GOAL_TIME) / reg.LOAD_FULL_SCALE
@@ -159,65 +161,35 @@ class StsServo(ServoFirmware):
         low, high = self.get(reg.MIN_POSITION), self.get(reg.MAX_POSITION)
         count = self.get(reg.GOAL_POSITION)
         count = min(max(count, low), high) if (low, high) != (0, 0) else count  # 0 and 0: several turns
-        return OperatingMode.POSITION, (count + self.get(reg.HOMING_OFFSET)) * reg.RAD_PER_COUNT
+        return OperatingMode.POSITION, (count - self.offset) * reg.RAD_PER_COUNT
 
     def controller(self) -> tuple[int, int, float]:
         """Return P gain and D gain of the position controller [counts], and the setpoint's top speed [rad/s]."""
         phase, count = self.get(reg.PHASE), abs(self.get(reg.GOAL_SPEED))
         unlimited = count == 0 and bool(phase & reg.PHASE_ZERO_IS_FASTEST)
-        speed_rad_s = math.inf if unlimited else count * reg.speed_unit_rad_s(phase)
-        return self.get(reg.P_GAIN), self.get(reg.D_GAIN), speed_rad_s
+        return *super().controller()[:2], math.inf if unlimited else count * reg.speed_unit_rad_s(phase)
 
     def acceleration_rad_s2(self) -> float:
         """Return the acceleration of the setpoint [rad/s^2]."""
-        count = self.get(reg.ACCELERATION)
-        return count * reg.ACCELERATION_UNIT * reg.RAD_PER_COUNT if count else math.inf
+        return self.get(reg.ACCELERATION) * reg.ACCELERATION.unit or math.inf
 
     def refresh(self, position_rad: float, velocity_rad_s: float, load: float, tick_ms: int = 0) -> None:
-        """Set the Present registers from a measurement of the plant.
-
-        Args:
-            position_rad: Angle from the encoder's zero [rad].
-            load: Fraction of the largest load, in [-1, 1].
-            tick_ms: Not used: it has no register of time.
-        """
-        del tick_ms
-        # Round the angle to the encoder's resolution, then to counts of the register.
-        step_rad = 2.0 * math.pi / self._encoder_counts
-        count = round(round(position_rad / step_rad) * step_rad / reg.RAD_PER_COUNT) - self.get(reg.HOMING_OFFSET)
+        """Set the registers of present values; it has no register of time."""
+        super().refresh(position_rad, velocity_rad_s, load)
         phase = self.get(reg.PHASE)
-        wrapped = count if phase & reg.PHASE_FULL_ANGLE else count % reg.COUNTS_PER_REVOLUTION
-        load = max(-1.0, min(1.0, load))
-        self.put(reg.PRESENT_POSITION, wrapped)
+        if not phase & reg.PHASE_FULL_ANGLE:
+            self.put(reg.PRESENT_POSITION, self.get(reg.PRESENT_POSITION) % reg.COUNTS_PER_REVOLUTION)
         self.put(reg.PRESENT_SPEED, round(velocity_rad_s / reg.speed_unit_rad_s(phase)))
-        self.put(reg.PRESENT_LOAD, round(load * reg.LOAD_FULL_SCALE))
-        self.put(reg.PRESENT_CURRENT, round(load * STALL_CURRENT_A / reg.CURRENT_UNIT_A))
+        self.put(reg.PRESENT_CURRENT, reg.PRESENT_CURRENT.count(max(-1.0, min(1.0, load)) * STALL_CURRENT_A))
         self.put(reg.MOVING, abs(velocity_rad_s / reg.RAD_PER_COUNT) > _MOVING_COUNTS_PER_S)
 
-    def read(self, address: int, length: int) -> tuple[int, bytes]:
-        """Return no error, and the bytes of the answer to a READ; beyond the table, zeros."""
-        return 0, bytes(self._memory[address : address + length]).ljust(length, b"\0")
-
-    def write(self, address: int, data: bytes) -> tuple[int, bool]:
-        """Write registers; return no error, and whether `command` may have changed."""
-        torque_was_on, moved = self.get(reg.TORQUE_ENABLE), False
-        for register in reg.TABLE.registers.values():
-            # Take the registers that lie wholly within the data.
-            begin = register.address - address
-            if not 0 <= begin <= len(data) - register.size:
-                continue
-            value = register.decode(data[begin : begin + register.size])
-            if not register.writable or register in _FIXED or not register.minimum <= value <= register.maximum:
-                continue
-            # Without the lock, EEPROM registers also survive a restart.
-            self.put(register, value)
-            moved |= register in _MOTION
-            if register.eeprom and not self.get(reg.LOCK):
-                place = slice(register.address, register.end)
-                self._saved = self._saved[: place.start] + register.encode(value) + self._saved[place.stop :]
-            if register == reg.GOAL_POSITION and self._goal_wakes:
-                self.put(reg.TORQUE_ENABLE, 1)
-        return 0, moved and bool(torque_was_on or self.get(reg.TORQUE_ENABLE))
+    def written(self, register: Register, value: int) -> None:
+        """Keep what is written without the lock over a restart; a goal may switch the torque on."""
+        if register.eeprom and not self.get(reg.LOCK):
+            place = slice(register.address, register.end)
+            self._saved = self._saved[: place.start] + register.encode(value) + self._saved[place.stop :]
+        if register == reg.GOAL_POSITION and self._goal_wakes:
+            self.put(reg.TORQUE_ENABLE, 1)
 
     def register_write(self, address: int, data: bytes) -> None:
         """Store a REG_WRITE until the next ACTION."""
@@ -247,8 +219,7 @@ class StsBus(InstructedBus[StsServo, "StsEmulation"]):
     broadcast ping, as their answers would collide.
     """
 
-    form = PROTOCOL
-    present = (reg.PRESENT_POSITION, reg.PRESENT_LOAD)
+    family = reg.FAMILY
     wild_counts = (8192, 32768)
 
     def __init__(self, plant: Plant, *arguments: Any) -> None:
@@ -275,7 +246,7 @@ class StsBus(InstructedBus[StsServo, "StsEmulation"]):
     def _status(self, servo: StsServo, error: int, data: bytes) -> bytes:
         """Return the bytes of an answer, with the faults of the settings."""
         sender = servo.servo_id ^ 0x40 if self.happens(self.config.wrong_id) else servo.servo_id
-        answer = PROTOCOL.build_status(sender, error, data)
+        answer = self.family.form.build_status(sender, error, data)
         return answer[:4] if self.happens(self.config.cut) else answer
 
 
@@ -302,11 +273,4 @@ class StsEmulation(BusEmulation):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, (low, high) in {
-            "wrong_id": (0, 1),
-            "cut": (0, 1),
-            "alarms": (1, 127),
-            "homing_offset": (-2047, 2047),
-        }.items():
-            if not low <= getattr(self, name) <= high:
-                raise UsageError(f"emulator: {name} = {getattr(self, name)} is outside [{low}, {high}]")
+        self.require({"wrong_id": (0, 1), "cut": (0, 1), "alarms": (1, 127), "homing_offset": (-2047, 2047)})

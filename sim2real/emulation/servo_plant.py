@@ -11,7 +11,7 @@ import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.hardware.device import OperatingMode
-from sim2real.hardware.dynamixel.registers import RAD_PER_COUNT
+from sim2real.hardware.dynamixel import RAD_PER_COUNT
 
 mj: Any = mujoco
 _HAND_NM_RAD, _HAND_DAMPING, _HAND_MOST_NM = 12.0, 0.5, 4.0  # assumed: a person's hand [N m/rad, N m s/rad, N m]

@@ -10,8 +10,8 @@ WORLDS: Final = "sim2real.worlds"
 """The entry point group of worlds, see `sim2real.robots.robot`."""
 BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = {
     DEVICES: {
-        "dynamixel": "sim2real.hardware.dynamixel.device:servos",
-        "feetech": "sim2real.hardware.feetech.device:servos",
+        "dynamixel": "sim2real.hardware.dynamixel:servos",
+        "feetech": "sim2real.hardware.feetech:servos",
         "unitree": "sim2real.hardware.unitree.device:legs",
     },
     WORLDS: {},

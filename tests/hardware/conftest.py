@@ -3,7 +3,8 @@ from virtual_bus import PLANTS, VirtualBus
 
 from sim2real.emulation.dynamixel import EmulatorConfig
 from sim2real.emulation.virtual import VirtualRobot
-from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
+from sim2real.hardware.bus.port import BusConfig
+from sim2real.hardware.dynamixel import DynamixelServos, VoltageDrive
 
 
 @pytest.fixture
@@ -22,23 +23,21 @@ def start_robot(tmp_path):
 
 
 @pytest.fixture
-def open_bus():
-    """Open a bus to a robot and shake hands with the servos given."""
-    buses = []
+def open_servos():
+    """Open DYNAMIXEL servos of a robot by voltage; with torque unless told otherwise."""
+    devices = []
 
-    def open_(robot, ids=(1,), mode=None, **config):
-        bus = ServoBus(BusConfig(robot.port, **{"silence_s": 1.0, **config}))
-        buses.append(bus)
-        bus.open()
-        bus.handshake(dict.fromkeys(ids))
-        if mode is not None:
-            bus.setup(mode)
-            bus.torque(True)
-        return bus
+    def open_(robot, ids=(1,), torque=True, drive=None, **config):
+        config = BusConfig(robot.port, **{"silence_s": 1.0, **config})
+        devices.append(DynamixelServos(config, ids, drive or VoltageDrive(5.0)))
+        devices[-1].open()
+        if torque:
+            devices[-1].enable()
+        return devices[-1]
 
     yield open_
-    for bus in buses:
-        bus.close()
+    for device in devices:
+        device.close()
 
 
 @pytest.fixture

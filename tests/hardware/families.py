@@ -16,14 +16,13 @@ from sim2real.emulation.bus import BusEmulation
 from sim2real.emulation.dynamixel import EmulatorConfig
 from sim2real.emulation.feetech import StsEmulation
 from sim2real.emulation.virtual import VirtualRobot
+from sim2real.hardware import dynamixel as dynamixel
+from sim2real.hardware import feetech as feetech
+from sim2real.hardware.bus.port import BusConfig
+from sim2real.hardware.bus.servos import ServoJoint
 from sim2real.hardware.device import Device, OperatingMode
-from sim2real.hardware.dynamixel import registers as dynamixel
-from sim2real.hardware.dynamixel.bus import BusConfig
-from sim2real.hardware.dynamixel.device import DynamixelServos
-from sim2real.hardware.dynamixel.drive import PositionDrive, VoltageDrive
-from sim2real.hardware.feetech import registers as feetech
-from sim2real.hardware.feetech.calibration import CalibratedJoint
-from sim2real.hardware.feetech.device import StsConfig, StsServos
+from sim2real.hardware.dynamixel import DynamixelServos, PositionDrive, VoltageDrive
+from sim2real.hardware.feetech import StsServos
 from sim2real.hardware.safety.gate import GateConfig
 from sim2real.hardware.safety.rig import Rig
 
@@ -112,7 +111,7 @@ def _angles(port, **limits):
 
 
 def _sts(port, **limits):
-    return StsServos(StsConfig(port, **limits), [CalibratedJoint(f"joint{i}", i) for i in IDS])
+    return StsServos(BusConfig(port, **limits), [ServoJoint(f"joint{i}", i) for i in IDS])
 
 
 def _board(port, silence_s=0.1):
@@ -148,7 +147,7 @@ VOLTS = Family(
     "FirstOrder",
     _volts,
     dynamixel.TORQUE_ENABLE,
-    np.full(3, 2.5),
+    np.full(3, 3.0),
     {"limit": 4.0},
 )
 ANGLES = Family(

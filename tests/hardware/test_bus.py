@@ -1,102 +1,74 @@
-"""The bus of DYNAMIXEL servos against the emulator, in virtual time."""
+"""DYNAMIXEL servos by voltage against the emulator, in virtual time: what they refuse, and what a lost bus says."""
 
+import numpy as np
 import pytest
 
 from sim2real.emulation.dynamixel import EmulatorConfig
 from sim2real.emulation.truth import Kind
 from sim2real.errors import HardwareLost, SafetyStop, Sim2RealError, UsageError
-from sim2real.hardware.device import OperatingMode
-from sim2real.hardware.dynamixel import registers as reg
-from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
-
-PWM = OperatingMode.PWM
+from sim2real.hardware import dynamixel as reg
+from sim2real.hardware.bus.port import BusConfig
+from sim2real.hardware.dynamixel import DynamixelServos, VoltageDrive
 
 
-def test_handshake_checks_ids_and_models(start_robot):
+def test_a_missing_servo_is_named_with_those_that_answer(start_robot, open_servos):
     robot = start_robot(ids=[1, 3])
-    with ServoBus(BusConfig(robot.port)) as bus:
-        assert bus.handshake({1: 1060, 3: None}) == {1: 1060, 3: 1060}
-        assert bus.ids == (1, 3)
-        with pytest.raises(HardwareLost, match=r"model 1060 \(XL430-W250\), expected 1200 \(XL330-M288\)"):
-            bus.handshake({1: 1200})
-        with pytest.raises(HardwareLost, match=r"servo 2 does not answer .* Available: \[1, 3\]"):
-            bus.handshake({2: None})
+    device = open_servos(robot, (1, 3), torque=False)
+    assert {i: m.name for i, m in device.models.items()} == {1: "XL430-W250", 3: "XL430-W250"}
+    assert device.facts() == {
+        "firmware": {"servo 1": "47", "servo 3": "47"},
+        "voltage": {"servo 1": "12.0 V", "servo 3": "12.0 V"},
+        "temperature": {"servo 1": "30 °C", "servo 3": "30 °C"},
+    }
+    device.close()
+    with pytest.raises(HardwareLost, match=r"servo 2 .* does not answer .* Available: \[1, 3\]"):
+        open_servos(robot, (2,))
 
 
-def test_facts_for_a_log_are_those_of_the_registers(start_robot):
-    robot = start_robot(ids=[1, 3])
-    with ServoBus(BusConfig(robot.port), (1, 3)) as bus:
-        assert bus.facts() == {
-            "firmware": {"servo 1": "47", "servo 3": "47"},
-            "voltage": {"servo 1": "12.0 V", "servo 3": "12.0 V"},
-            "temperature": {"servo 1": "30 °C", "servo 3": "30 °C"},
-        }
+def test_opening_prepares_the_servo_and_torque_arms_the_watchdog(start_robot, open_servos):
+    device = open_servos(start_robot(), silence_s=0.1)
+    registers = (reg.OPERATING_MODE, reg.RETURN_DELAY_TIME, reg.TORQUE_ENABLE, reg.BUS_WATCHDOG)
+    assert [device.link.read(1, r) for r in registers] == [16, 0, 1, 5]
+    device.disable()
+    assert [device.link.read(1, r) for r in registers] == [16, 0, 0, 0]
 
 
-def test_setup_prepares_the_servo_and_torque_arms_the_watchdog(start_robot, open_bus):
-    robot = start_robot()
-    bus = open_bus(robot, mode=PWM, silence_s=0.1)
-    values = {r.name: bus.read(1, r) for r in (reg.OPERATING_MODE, reg.RETURN_DELAY_TIME, reg.TORQUE_ENABLE)}
-    assert values == {"operating_mode": 16, "return_delay_time": 0, "torque_enable": 1}
-    assert bus.read(1, reg.BUS_WATCHDOG) == 5
-    bus.torque(False)
-    assert bus.read(1, reg.BUS_WATCHDOG) == 0
+@pytest.mark.parametrize("volts", [5.1, -10.0, float("nan"), float("inf")])
+def test_voltages_out_of_range_are_refused(start_robot, open_servos, volts):
+    with pytest.raises(SafetyStop, match=r"'servo 1': .* V is outside \[-5"):
+        open_servos(start_robot()).command(np.array([volts]))
 
 
-def test_velocity_and_position_goals(start_robot, open_bus):
-    robot = start_robot(ids=[1, 2])
-    bus = open_bus(robot, (1, 2), OperatingMode.EXTENDED_POSITION, silence_s=0.0)
-    bus.write_goal_position({1: 0.5, 2: -0.5})
-    bus.clock.sleep(0.8)
-    assert bus.read_state().position_rad == pytest.approx([0.5, -0.5], abs=0.01)
-    bus.setup(OperatingMode.VELOCITY)
-    bus.torque(True)
-    bus.write_goal_velocity({1: 1.0})
-    bus.clock.sleep(0.3)
-    assert bus.read_state([1]).velocity_rad_s == pytest.approx([1.0], abs=0.05)
-
-
-@pytest.mark.parametrize("goal", [1.01, -2.0, float("nan"), float("inf")])
-def test_goals_out_of_range_are_refused(start_robot, open_bus, goal):
-    bus = open_bus(start_robot())
-    with pytest.raises(SafetyStop, match=r"goal_pwm of servo 1: .* is outside \[-1, 1\]"):
-        bus.write_goal_pwm({1: goal})
-
-
-def test_refusals_of_the_servo_are_explained(start_robot, open_bus):
-    bus = open_bus(start_robot(), mode=PWM)
+def test_refusals_of_the_servo_are_explained(start_robot, open_servos):
     with pytest.raises(Sim2RealError, match="servo 1 refused write of 3 to operating_mode: the register cannot"):
-        bus.write(1, reg.OPERATING_MODE, 3)
+        open_servos(start_robot()).link.write(1, reg.OPERATING_MODE, 3)
 
 
-def test_reading_needs_servos(start_robot):
-    with ServoBus(BusConfig(start_robot().port)) as bus, pytest.raises(UsageError, match="handshake"):
-        bus.read_state()
-    with ServoBus(BusConfig(start_robot().port)) as bus, pytest.raises(UsageError, match="handshake"):
-        bus.check()
+@pytest.mark.parametrize(
+    ("config", "ids", "message"),
+    [
+        ({"silence_s": 3.0}, (1,), "silence_s"),
+        ({"baud_rate": 1234}, (1,), r"baud rate 1234 .* Available: \[9600"),
+        ({}, (1, 254), "from 0 to 253"),
+        ({}, (), "at least one"),
+    ],
+)
+def test_configurations_that_make_no_sense(config, ids, message):
+    with pytest.raises(UsageError, match=message):
+        DynamixelServos(BusConfig("/dev/null", **config), ids, VoltageDrive(5.0))
 
 
-def test_configurations_that_make_no_sense():
-    with pytest.raises(UsageError, match="silence_s"):
-        BusConfig("/dev/null", silence_s=3.0)
-    with pytest.raises(UsageError, match=r"baud rate 1234 .* Available: \[9600"):
-        BusConfig("/dev/null", baud_rate=1234)
-    with pytest.raises(UsageError, match="an id is a number from 0 to 253"):
-        ServoBus(BusConfig("/dev/null"), [1, 254])
-
-
-def test_servo_watchdog_stops_the_motor_and_is_named(start_robot, open_bus):
+def test_servo_watchdog_stops_the_motor_and_is_named(start_robot, open_servos):
     robot = start_robot(config=EmulatorConfig(actuation_latency_s=0.005))
-    bus = open_bus(robot, mode=PWM, silence_s=0.06, guardian=False)
-    sent_ns = bus.write_goal_pwm({1: 1.0}).t_sent_ns
-    bus.clock.sleep(0.2)
-    with pytest.raises(SafetyStop, match="bus watchdog of servo 1 has tripped"):
-        bus.write_goal_pwm({1: 1.0})
-    with pytest.raises(SafetyStop, match="bus watchdog"):
-        bus.check()
-    bus.torque(True)
-    bus.write_goal_pwm({1: 0.5})
-    bus.check()
+    device = open_servos(robot, silence_s=0.06, guardian=False)
+    sent_ns = device.command(np.array([5.0])).t_sent_ns
+    device.clock.sleep(0.2)
+    for call in (lambda: device.command(np.array([5.0])), device.check):
+        with pytest.raises(SafetyStop, match="bus watchdog of servo 1 has tripped"):
+            call()
+    device.enable()
+    device.command(np.array([2.5]))
+    device.check()
     robot.stop()
     truth = robot.truth()
     trip_ns = truth.of(Kind.WATCHDOG)["t_ns"][0]
@@ -107,28 +79,21 @@ def test_servo_watchdog_stops_the_motor_and_is_named(start_robot, open_bus):
     assert abs(zero["t_ns"] - trip_ns) <= 500_000
 
 
-def test_overload_stops_with_its_name(start_robot, open_bus):
-    bus = open_bus(start_robot(config=EmulatorConfig(overload_after_s=0.5)), mode=PWM)
-    bus.clock.sleep(0.5)
-    with pytest.raises(SafetyStop, match="servo 1 has stopped itself: overload"):
-        bus.read_state()
-
-
 @pytest.mark.parametrize("held_up_s", [0.0, 0.02])
-def test_a_lost_bus_names_the_computer_if_its_own_thread_did_not_run(start_robot, monkeypatch, held_up_s):
+def test_a_lost_bus_names_the_computer_if_its_own_thread_did_not_run(start_robot, open_servos, monkeypatch, held_up_s):
     robot = start_robot(config=EmulatorConfig(silent_after_s=0.5))
-    with ServoBus(BusConfig(robot.port, silence_s=1.0), (1,)) as bus:
-        robot.clock.sleep(0.6)
-        read = robot.read
+    device = open_servos(robot, torque=False)
+    robot.clock.sleep(0.6)
+    read = robot.read
 
-        def late(until_ns):
-            data = read(until_ns)
-            robot.stall(held_up_s)
-            return data
+    def late(until_ns):
+        data = read(until_ns)
+        robot.stall(held_up_s)
+        return data
 
-        monkeypatch.setattr(robot, "read", late)
-        with pytest.raises(HardwareLost) as lost:
-            bus.read(1, reg.PRESENT_POSITION)
+    monkeypatch.setattr(robot, "read", late)
+    with pytest.raises(HardwareLost) as lost:
+        device.link.read(1, reg.PRESENT_POSITION)
     assert ("computer is too busy" in str(lost.value)) == (held_up_s > 0.0)
     assert ("cable" in str(lost.value)) == (held_up_s == 0.0)
 

@@ -9,11 +9,10 @@ from pipelines.go2.plant import Go2Body
 from sim2real.emulation.conformance import DeviceConformance
 from sim2real.emulation.dynamixel import EmulatorConfig
 from sim2real.emulation.feetech import StsEmulation
-from sim2real.hardware.dynamixel.bus import BusConfig
-from sim2real.hardware.dynamixel.device import DynamixelServos
-from sim2real.hardware.dynamixel.drive import PositionDrive, VoltageDrive
-from sim2real.hardware.feetech.calibration import CalibratedJoint
-from sim2real.hardware.feetech.device import StsConfig, StsServos
+from sim2real.hardware.bus.port import BusConfig
+from sim2real.hardware.bus.servos import ServoJoint
+from sim2real.hardware.dynamixel import DynamixelServos, PositionDrive, VoltageDrive
+from sim2real.hardware.feetech import StsServos
 
 
 class TestOneServoByVoltage(DeviceConformance):
@@ -39,8 +38,8 @@ class TestFeetech(DeviceConformance):
     plant = f"{PLANTS}:Joints"
 
     def make_device(self, port):
-        joints = [CalibratedJoint(f"joint{i}", i) for i in (1, 2, 3)]
-        return StsServos(StsConfig(port, max_silence_s=0.5, silence_s=0.6), joints)
+        joints = [ServoJoint(f"joint{i}", i) for i in (1, 2, 3)]
+        return StsServos(BusConfig(port, max_silence_s=0.5, silence_s=0.6), joints)
 
 
 class TestODrive(DeviceConformance):

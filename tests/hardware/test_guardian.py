@@ -14,8 +14,8 @@ import pytest
 from sim2real.emulation import process as emulator
 from sim2real.emulation.dynamixel import EmulatorConfig
 from sim2real.emulation.truth import Kind
+from sim2real.hardware import dynamixel as reg
 from sim2real.hardware.device import OperatingMode
-from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.safety import guardian_process
 from sim2real.hardware.safety.guardian_process import BEAT, REST, Guard
 from sim2real.runtime import clock
@@ -55,37 +55,36 @@ def test_a_robot_whose_torque_was_off_may_have_another_master(last, acts):
         assert list(guard.acted) == acts
 
 
-def test_silence_is_allowed_while_torque_is_off_and_the_port_is_free_afterwards(start_robot, open_bus):
+def test_silence_is_allowed_while_torque_is_off_and_the_port_is_free_afterwards(start_robot, open_servos):
     robot = start_robot()
-    bus = open_bus(robot, mode=OperatingMode.PWM, silence_s=0.1)
-    bus.torque(False)
+    device = open_servos(robot, silence_s=0.1)
+    device.disable()
     robot.stall(0.3)
-    bus.torque(True)
-    bus.write_goal_pwm({1: 0.5})
-    bus.close()
+    device.enable()
+    device.command(np.array([2.5]))
+    device.close()
     assert robot.reports == []
-    assert open_bus(robot, mode=OperatingMode.PWM).read(1, reg.TORQUE_ENABLE) == 1
+    assert open_servos(robot).link.read(1, reg.TORQUE_ENABLE) == 1
 
 
-def test_it_says_nothing_on_the_bus_while_all_is_well(start_robot, open_bus):
+def test_it_says_nothing_on_the_bus_while_all_is_well(start_robot, open_servos):
     robot = start_robot()
-    bus = open_bus(robot, mode=OperatingMode.PWM)
-    opened_ns, before = robot.now_ns(), bus.counters.transactions
+    device = open_servos(robot)
+    opened_ns, before = robot.now_ns(), device.counters.transactions
     for _ in range(50):
-        bus.read_state()
+        device.measure()
         robot.sleep(0.005)
-    done_ns, asked = robot.now_ns(), bus.counters.transactions - before
-    bus.close()
+    done_ns, asked = robot.now_ns(), device.counters.transactions - before
+    device.close()
     rows = robot.truth().rows
     inside = (rows["t_ns"] > opened_ns) & (rows["t_ns"] < done_ns)
     assert np.count_nonzero(np.isin(rows["kind"][inside], (Kind.SAMPLE, Kind.REPLY))) == asked == 50
 
 
-def test_without_it_a_servo_that_only_notices_goes_on_when_its_host_dies(start_robot, open_bus):
+def test_without_it_a_servo_that_only_notices_goes_on_when_its_host_dies(start_robot, open_servos):
     """An XL330: docs/guides/safety.md says so."""
     robot = start_robot(config=EmulatorConfig(model_number=1200))
-    bus = open_bus(robot, mode=OperatingMode.PWM, silence_s=0.2, guardian=False)
-    bus.write_goal_pwm({1: 0.7})
+    open_servos(robot, silence_s=0.2, guardian=False).command(np.array([3.5]))
     robot.kill_host()
     robot.sleep(1.0)
     truth = robot.truth()

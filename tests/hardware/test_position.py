@@ -5,15 +5,15 @@ import math
 import numpy as np
 import pytest
 
+from sim2real.emulation.dynamixel import EmulatedServo
 from sim2real.emulation.truth import Kind
-from sim2real.errors import HardwareLost, SafetyStop, Sim2RealError, UsageError
+from sim2real.errors import HardwareLost, SafetyStop, UsageError
+from sim2real.hardware import dynamixel as reg
+from sim2real.hardware.bus.link import ServoLink
 from sim2real.hardware.bus.packets import Instruction
+from sim2real.hardware.bus.port import BusConfig
 from sim2real.hardware.device import OperatingMode
-from sim2real.hardware.dynamixel import registers as reg
-from sim2real.hardware.dynamixel.bus import BusConfig, BusLink, ServoBus
-from sim2real.hardware.dynamixel.device import DynamixelServos
-from sim2real.hardware.dynamixel.drive import PositionDrive, VoltageDrive
-from sim2real.hardware.dynamixel.protocol import PROTOCOL
+from sim2real.hardware.dynamixel import PROTOCOL, DynamixelServos, PositionDrive, VoltageDrive
 from sim2real.hardware.safety.gate import GateConfig
 from sim2real.hardware.safety.rig import Rig
 
@@ -87,8 +87,8 @@ def test_gains_and_profile_reach_servos_and_plant(open_arm):
     drive = PositionDrive(p_gain=1000, profile_velocity_rad_s=1.0, d_gain=7)
     rig, robot = open_arm(drive)
     registers = (reg.POSITION_P_GAIN, reg.POSITION_I_GAIN, reg.POSITION_D_GAIN, reg.PROFILE_ACCELERATION)
-    assert [rig.device.read(2, register) for register in registers] == [1000, 0, 7, 0]
-    assert rig.device.read(2, reg.OPERATING_MODE) == OperatingMode.POSITION
+    assert [rig.device.link.read(2, register) for register in registers] == [1000, 0, 7, 0]
+    assert rig.device.link.read(2, reg.OPERATING_MODE) == OperatingMode.POSITION
     rig.start()
     speeds = []
     for _ in range(15):
@@ -108,13 +108,13 @@ def test_a_rebooted_servo_gets_its_settings_again(open_arm):
     rig, _ = open_arm()
     with rig.device.link.hold():
         rig.device.link.port.write(PROTOCOL.build(3, Instruction.REBOOT))
-    assert rig.device.read(3, reg.POSITION_P_GAIN) == 640
+    assert rig.device.link.read(3, reg.POSITION_P_GAIN) == 640
     rig.start()
-    assert rig.device.read(3, reg.POSITION_P_GAIN) == 800
+    assert rig.device.link.read(3, reg.POSITION_P_GAIN) == 800
 
 
 def test_a_setting_that_a_servo_does_not_keep_ends_it(open_arm, start_robot, monkeypatch):
-    write = BusLink.write
+    write = ServoLink.write
 
     def forgetful(self, servo_id, register, value):
         if (servo_id, register) != (2, reg.POSITION_P_GAIN):
@@ -123,7 +123,7 @@ def test_a_setting_that_a_servo_does_not_keep_ends_it(open_arm, start_robot, mon
 
     robot = start_robot("Joints")
     with monkeypatch.context() as patched:
-        patched.setattr(BusLink, "write", forgetful)
+        patched.setattr(ServoLink, "write", forgetful)
         with pytest.raises(HardwareLost, match=r"servo 2 .* position_p_gain is 640 after 800 was written"):
             open_arm(robot=robot)
     open_arm(robot=robot)  # the port is free again
@@ -163,18 +163,16 @@ def test_a_tripped_servo_is_noticed_although_goals_are_not_confirmed(open_arm):
 def test_a_joint_outside_of_what_servos_take_keeps_its_torque_off(open_arm, start_robot):
     robot = start_robot("Joints", start_rad=[0.0, 3.3, 0.0])
     rig, _ = open_arm(robot=robot)
-    with pytest.raises(Sim2RealError, match=r"servo 2 refused write of .* to goal_position: the value is beyond"):
+    with pytest.raises(SafetyStop, match=r"'servo 2' is at 3.3 rad, outside"):
         rig.start()
-    assert rig.device.read(2, reg.TORQUE_ENABLE) == 0
+    assert rig.device.link.read(2, reg.TORQUE_ENABLE) == 0
 
 
 def test_limits_beyond_the_servos_own_are_refused(open_arm, start_robot):
     robot = start_robot("Joints")
     with pytest.raises(UsageError, match=r"(?s)limit 3.2 exceeds the reach of the motors, .*-3.142.* to .*3.141"):
         open_arm(robot=robot, limit=3.2)
-    with ServoBus(BusConfig(robot.port)) as bus:
-        bus.handshake({2: None})
-        bus.write(2, reg.MAX_POSITION_LIMIT, 3000)
+    robot.bus.servos[2].put(reg.MAX_POSITION_LIMIT, 3000)
     with pytest.raises(UsageError, match=r"to \[3.141, 1.461, 3.141\] rad"):
         open_arm(robot=robot)
 
@@ -211,39 +209,19 @@ def test_drives_that_registers_cannot_hold(settings, message):
             VoltageDrive(supply_v)
 
 
-class FakeBus:
-    """Registers of one servo, as a host sees them."""
-
-    ids = (1,)
-
-    def __init__(self, **values):
-        self.values = {**{register.name: register.default for register in reg.TABLE.registers.values()}, **values}
-
-    def read(self, servo_id, register):
-        return self.values[register.name]
-
-    def write(self, servo_id, register, value):
-        self.values[register.name] = value
-
-    @property
-    def link(self):
-        return self
-
-    def require(self, servo_id, register, value):
-        assert self.values[register.name] == value
-
-
 @pytest.mark.parametrize(("found", "wanted"), [(0, 0), (1, 1), (4, 0), (13, 1)])
-def test_profiles_are_by_speed_and_goals_switch_no_torque_on(found, wanted):
-    bus = FakeBus(drive_mode=found)
-    DRIVE.prepare(bus)
-    assert bus.values["drive_mode"] == wanted
+def test_profiles_are_by_speed_and_goals_switch_no_torque_on(open_arm, start_robot, monkeypatch, found, wanted):
+    monkeypatch.setattr(EmulatedServo, "fixed", (reg.ID, reg.BAUD_RATE))
+    robot = start_robot("Joints")
+    robot.bus.servos[1].put(reg.DRIVE_MODE, found)
+    open_arm(robot=robot)
+    assert robot.bus.servos[1].get(reg.DRIVE_MODE) == wanted
 
 
 @pytest.mark.parametrize(("speed_rad_s", "count"), [(math.inf, 0), (0.001, 1), (1.0, 42)])
 def test_a_slow_profile_is_not_rounded_to_none(open_arm, speed_rad_s, count):
     rig, _ = open_arm(PositionDrive(800, speed_rad_s))
-    assert rig.device.read(1, reg.PROFILE_VELOCITY) == count
+    assert rig.device.link.read(1, reg.PROFILE_VELOCITY) == count
 
 
 def test_a_soft_stop_leaves_the_goals_where_they_are_until_all_is_still(open_arm):
@@ -256,4 +234,4 @@ def test_a_soft_stop_leaves_the_goals_where_they_are_until_all_is_still(open_arm
     assert np.array_equal(held, np.broadcast_to(moving[-1], held.shape))
     assert rig.eased
     np.testing.assert_allclose(reading.position_rad, moving[-1], atol=0.02)
-    assert rig.device.read(1, reg.TORQUE_ENABLE) == 1, "torque is somebody else's decision"
+    assert rig.device.link.read(1, reg.TORQUE_ENABLE) == 1, "torque is somebody else's decision"

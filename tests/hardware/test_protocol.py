@@ -6,8 +6,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from sim2real.hardware.bus.packets import Instruction, Packet, Parser
-from sim2real.hardware.dynamixel.protocol import HEADER, PROTOCOL, crc16
-from sim2real.hardware.feetech.protocol import PROTOCOL as STS_PROTOCOL
+from sim2real.hardware.dynamixel import HEADER, PROTOCOL, crc16
+from sim2real.hardware.feetech import PROTOCOL as STS_PROTOCOL
 
 build = PROTOCOL.build
 

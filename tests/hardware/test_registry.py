@@ -3,8 +3,7 @@
 import pytest
 
 from sim2real.errors import UsageError
-from sim2real.hardware.dynamixel.device import DynamixelServos
-from sim2real.hardware.dynamixel.drive import VoltageDrive
+from sim2real.hardware.dynamixel import DynamixelServos, VoltageDrive
 from sim2real.hardware.registry import available, load_device
 
 PACKAGE = """

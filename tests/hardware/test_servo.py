@@ -3,9 +3,9 @@ import math
 import pytest
 
 from sim2real.emulation.dynamixel import EmulatedServo
+from sim2real.hardware import dynamixel as reg
 from sim2real.hardware.device import OperatingMode
-from sim2real.hardware.dynamixel import registers as reg
-from sim2real.hardware.dynamixel.protocol import StatusError
+from sim2real.hardware.dynamixel import StatusError
 
 
 def write(servo, register, value):
@@ -61,7 +61,7 @@ def test_a_write_of_several_registers_is_all_or_nothing(servo):
 def test_homing_offset_shifts_present_and_goal_alike(servo):
     write(servo, reg.HOMING_OFFSET, 100)
     servo.refresh(1.0, 0.0, 0.0, 0)
-    assert servo.get(reg.PRESENT_POSITION) == reg.count_from_rad(1.0) + 100
+    assert servo.get(reg.PRESENT_POSITION) == reg.GOAL_POSITION.count(1.0) + 100
     in_mode(servo, OperatingMode.POSITION)
     assert servo.command()[1] == pytest.approx(1.0, abs=reg.RAD_PER_COUNT)
 
@@ -108,7 +108,7 @@ PWM, VELOCITY, POSITION, EXTENDED = (OperatingMode[n] for n in ("PWM", "VELOCITY
         (VELOCITY, [(reg.GOAL_VELOCITY, 100, OK)], (VELOCITY, 100 * reg.RAD_S_PER_COUNT)),
         (POSITION, [(reg.GOAL_POSITION, 2048, OK)], (POSITION, math.pi)),
         (EXTENDED, [(reg.GOAL_POSITION, -5000, OK)], (POSITION, -5000 * reg.RAD_PER_COUNT)),
-        (POSITION, [], (POSITION, reg.count_from_rad(1.0) * reg.RAD_PER_COUNT)),  # torque on holds the position
+        (POSITION, [], (POSITION, reg.GOAL_POSITION.count(1.0) * reg.RAD_PER_COUNT)),  # torque on holds the position
         # Settings are locked while torque is on.
         (PWM, [(reg.OPERATING_MODE, POSITION, StatusError.ACCESS), (reg.RETURN_DELAY_TIME, 0, StatusError.ACCESS)],
          (PWM, 0.0)),
@@ -131,8 +131,8 @@ def test_what_is_written_drives_the_motor(servo, mode, writes, command):
     [
         (1060, None, 0.0, reg.BUS_WATCHDOG),
         (1200, True, 0.0, reg.TORQUE_ENABLE),
-        (1060, False, reg.fraction_from_pwm(300), reg.TORQUE_ENABLE),
-        (1200, None, reg.fraction_from_pwm(300), reg.TORQUE_ENABLE),  # a 330 turns on
+        (1060, False, 300 * reg.GOAL_PWM.unit, reg.TORQUE_ENABLE),
+        (1200, None, 300 * reg.GOAL_PWM.unit, reg.TORQUE_ENABLE),  # a 330 turns on
     ],
 )
 def test_a_watchdog_that_has_tripped_refuses_goals(model, stops, fraction, off_by):

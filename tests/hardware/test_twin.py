@@ -8,7 +8,7 @@ import pytest
 from sim2real.emulation.servo_plant import ServoPlant
 from sim2real.errors import UsageError
 from sim2real.hardware.device import OperatingMode
-from sim2real.hardware.dynamixel.registers import RAD_PER_COUNT
+from sim2real.hardware.dynamixel import RAD_PER_COUNT
 from sim2real.stages.load import load_module, load_robot
 
 CENTRE_RAD = 2048 * RAD_PER_COUNT

@@ -6,10 +6,10 @@ from virtual_bus import PLANTS
 
 from sim2real.emulation.dynamixel import EmulatorConfig
 from sim2real.emulation.virtual import VirtualRobot
+from sim2real.hardware import dynamixel as reg
 from sim2real.hardware.bus.packets import Instruction, Parser
 from sim2real.hardware.bus.port import open_port
-from sim2real.hardware.dynamixel import registers as reg
-from sim2real.hardware.dynamixel.protocol import PROTOCOL, StatusError
+from sim2real.hardware.dynamixel import PROTOCOL, StatusError
 
 OK = 0
 
@@ -144,7 +144,7 @@ def test_a_motor_turns_only_with_torque(sdk):
     assert sdk.write(1, reg.OPERATING_MODE, 3) == (OK, StatusError.ACCESS)
     sdk.write(1, reg.GOAL_PWM, 400)
     sdk.robot.sleep(0.3)
-    speed_rad_s = reg.rad_s_from_count(sdk.read(1, reg.PRESENT_VELOCITY)[0])
+    speed_rad_s = reg.RAD_S_PER_COUNT * sdk.read(1, reg.PRESENT_VELOCITY)[0]
     assert speed_rad_s == pytest.approx(6.0 * 400 / 885, rel=0.01)
     sdk.write(1, reg.TORQUE_ENABLE, 0)
     sdk.robot.sleep(0.4)

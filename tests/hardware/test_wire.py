@@ -14,12 +14,12 @@ from sim2real.emulation.feetech import StsEmulation
 from sim2real.emulation.plant import ConfigurablePlant
 from sim2real.emulation.truth import Kind
 from sim2real.errors import UsageError
+from sim2real.hardware import dynamixel as reg
+from sim2real.hardware import feetech as sts_reg
 from sim2real.hardware.bus.packets import BROADCAST_ID, Instruction, PacketFormat
 from sim2real.hardware.device import OperatingMode
-from sim2real.hardware.dynamixel import registers as reg
-from sim2real.hardware.dynamixel.protocol import PROTOCOL
-from sim2real.hardware.feetech import registers as sts_reg
-from sim2real.hardware.feetech.protocol import PROTOCOL as STS_PROTOCOL
+from sim2real.hardware.dynamixel import PROTOCOL
+from sim2real.hardware.feetech import PROTOCOL as STS_PROTOCOL
 
 MS = 1_000_000
 STEP_NS = 500_000

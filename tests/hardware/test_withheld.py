@@ -6,8 +6,8 @@ from families import ANGLES, VOLTS
 
 from sim2real.emulation.truth import Kind
 from sim2real.errors import UsageError
+from sim2real.hardware import dynamixel as reg
 from sim2real.hardware.bus.packets import Instruction
-from sim2real.hardware.dynamixel import registers as reg
 
 START_RAD = np.array([0.5, -0.8, 0.3])
 

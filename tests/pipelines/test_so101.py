@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sim2real.errors import UsageError
-from sim2real.hardware.feetech import registers
+from sim2real.hardware import feetech as registers
 from sim2real.hardware.safety.limits import GateLimits
 from sim2real.stages.load import load_module, load_robot
 from sim2real.stages.session.excitation import excitation

@@ -116,9 +116,9 @@ def test_without_a_calibration_the_motion_makes_one(arm, tmp_path, monkeypatch):
 
 def test_two_servos_of_one_id_are_refused(arm, tmp_path, monkeypatch):
     """Their answers collide on the wire; here the second one comes after the first."""
-    from sim2real.hardware.feetech.device import StsLink
+    from sim2real.hardware.bus.link import ServoLink
 
-    real, alone = StsLink.answering, arm()
-    monkeypatch.setattr(StsLink, "answering", lambda self, packet, wait_s: 2 * real(self, packet, wait_s))
+    real, alone = ServoLink.answering, arm()
+    monkeypatch.setattr(ServoLink, "answering", lambda self, packet, wait_s: 2 * real(self, packet, wait_s))
     with pytest.raises(HardwareLost, match=r"two servos on .* have the id 1"):
         calibrate(alone.port, GUIDE, tmp_path / "calibration.json")

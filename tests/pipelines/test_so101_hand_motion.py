@@ -8,8 +8,8 @@ from test_so101_calibration import FAULTS, GOOD, GUIDE, PERSON, WHOLE_MOTION
 from wrong_arms import RAD_PER_COUNT, ZERO_COUNTS, WrongArm
 
 from sim2real.errors import HardwareLost
-from sim2real.hardware.feetech.calibration import CalibratedJoint
-from sim2real.hardware.feetech.hand_motion import HandMotion
+from sim2real.hardware.bus.servos import ServoJoint
+from sim2real.hardware.hand_motion import HandMotion
 
 PERIOD_S, PATIENCE_S, OFFSET = 0.02, 8.0, 85
 
@@ -48,7 +48,7 @@ def test_a_right_calibration_and_a_whole_motion_fit(tmp_path):
 
 def test_without_a_calibration_the_middle_between_the_stops_is_the_zero(tmp_path):
     """The encoders' seam is inside of the joints' travel."""
-    joints = tuple(CalibratedJoint(name, entry["id"]) for name, entry in GOOD.items())
+    joints = tuple(ServoJoint(name, entry["id"]) for name, entry in GOOD.items())
     motion, complete = moved(tmp_path, joints, False, offset=1900)
     assert complete
     assert set(motion.directions.values()) == {1}

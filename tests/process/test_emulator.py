@@ -15,7 +15,7 @@ from dynamixel_sdk import GroupSyncRead, GroupSyncWrite, PacketHandler, PortHand
 from sim2real.emulation.dynamixel import EmulatorConfig
 from sim2real.emulation.process import EmbeddedRobot
 from sim2real.errors import HardwareLost
-from sim2real.hardware.dynamixel import registers as reg
+from sim2real.hardware import dynamixel as reg
 
 pytestmark = pytest.mark.process
 

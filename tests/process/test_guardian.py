@@ -27,11 +27,12 @@ XL330 = 1200
 SILENCE_S = 1.0
 HOST = """
 import os, signal, sys, time
+import numpy as np
 from sim2real.errors import Sim2RealError
-from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
-from sim2real.hardware.device import OperatingMode
+from sim2real.hardware.bus.port import BusConfig
+from sim2real.hardware.dynamixel import DynamixelServos, VoltageDrive
 
-bus = ServoBus(BusConfig({port!r}, silence_s={silence_s}, max_silence_s=1.0))
+bus = DynamixelServos(BusConfig({port!r}, silence_s={silence_s}, max_silence_s=1.0), (1, 2, 3), VoltageDrive(1.0))
 bus.open()
 
 def die_in_the_middle_of_a_packet(number, frame):
@@ -39,16 +40,14 @@ def die_in_the_middle_of_a_packet(number, frame):
     os.kill(os.getpid(), signal.SIGKILL)
 
 signal.signal(signal.SIGUSR1, die_in_the_middle_of_a_packet)
-ids = (1, 2, 3)
-bus.handshake(dict.fromkeys(ids))
-bus.setup(OperatingMode.PWM)
-bus.torque(True)
-bus.write_goal_pwm(dict.fromkeys(ids, 0.7))
+bus.enable()
+goals = np.full(3, 0.7)
+bus.command(goals)
 print(bus.guardian_pid, flush=True)
 try:
     while True:
-        bus.write_goal_pwm(dict.fromkeys(ids, 0.7))
-        bus.read_state()
+        bus.command(goals)
+        bus.measure()
         time.sleep(0.01)
 except Sim2RealError as error:
     bus.close()

@@ -5,18 +5,17 @@ after a fixed 34 ms, drop the error bytes of a synchronised read, and confuse a 
 """
 
 import threading
-from abc import ABC, abstractmethod
 from array import array
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from typing import ClassVar, Final
+from typing import Final
 
 import numpy as np
 
 from sim2real.errors import HardwareLost, SafetyStop
-from sim2real.hardware.bus.packets import Answer, Instruction, Packet, PacketFormat, Parser, of_servos
-from sim2real.hardware.bus.port import LinkConfig, open_port
-from sim2real.hardware.bus.registers import MemoryTable, Register
+from sim2real.hardware.bus.packets import Answer, Instruction, Packet, Parser, of_servos
+from sim2real.hardware.bus.port import BusConfig, open_port
+from sim2real.hardware.bus.registers import Family, Register
 from sim2real.hardware.device import Counters, Transaction
 from sim2real.hardware.safety.guardian import Guardian
 
@@ -26,56 +25,50 @@ _SAFE_PAUSE_S: Final = 0.002
 _FORCED_ATTEMPTS: Final = 5
 _MIN_LOSSES: Final = 3  # fewer missing answers in a long time mean that this process was not scheduled
 _BUSY_SHARE: Final = 0.3  # of a silence: if this thread was held up for longer, the computer is to blame
-_PADS: Final = 4
 _SCANNED: Final = 20
 _CONFIRMING_BYTES: Final = 17  # no other read is as long, so a late answer to another read cannot confirm
-_BARRIER_BYTES: Final = 18  # and more: the shortest read that only a barrier makes
+_BARRIER_BYTES: Final = 18  # and more: the shortest read that only `_drain` makes
 
 
-class ServoLink(ABC):
+class ServoLink:
     """Owner of port and lock. Every method may be called from any thread.
 
     While `at_rest` is set, nothing that could move a motor leaves through here, neither "torque on" nor a goal: such an
     instruction raises SafetyStop, also if it waits for the lock, or for the answer to its first attempt, when `at_rest`
     is set.
 
+    Args:
+        failure: Returns the error that an answer to an instruction reports: SafetyStop if the servo has stopped itself.
+
     Attributes:
         at_rest: Whether the torque was taken off and not switched on again.
         off_packet: The instruction that takes the torque of all servos off; no servo answers it.
-        ping_bytes: Bytes of data of the answer to a ping.
 
     Raises:
         HardwareLost: The port cannot be opened, or another process uses it.
     """
 
-    form: ClassVar[PacketFormat]
-    table: ClassVar[MemoryTable]
-    ping_bytes: ClassVar[int] = 0
-
-    def __init__(self, config: LinkConfig) -> None:
-        self.config = config
+    def __init__(self, config: BusConfig, family: Family, failure: Callable[[Answer, str], Exception]) -> None:
+        self.config, self.family, self.form = config, family, family.form
         self.guardian: Guardian | None = None
         self.closed = False
         self.at_rest = False
         self.off_packet = b""
+        self._failure = failure
         # Counts of this session; the lock serialises transactions.
         self._transactions = self._retries = self._lost = self._late = 0
         self._late_us = array("i")
         self._lock = threading.Lock()
         self._parser = Parser(self.form)
         self._waiting: list[Packet] = []
-        self._pad = self._barriers = 0
-        self._unheard: set[int] = set()  # lengths of answers that are missing and may still come
+        self._unsettled = False  # whether an answer to a read is missing and may still come
+        self._drains = 0
         # Begin and end of the present silence, None after an answer; and its missing answers.
         self._silent_ns: tuple[int, int] | None = None
         self._missed = self._held_up_ns = 0
         self._sent_ns = 0
         self.port = open_port(config.port, config.baud_rate)
         self.clock = self.port.clock
-
-    @abstractmethod
-    def require_fine(self, answer: Answer, what: str) -> None:
-        """Raise the error that an answer to the instruction ``what`` reports: SafetyStop if the servo has stopped."""
 
     @property
     def counters(self) -> Counters:
@@ -101,16 +94,9 @@ class ServoLink(ABC):
         Args:
             despite_error: Whether errors in the answers are ignored.
         """
-        # After a missing answer, more bytes are requested: if it still comes, it is recognised by its length. Taken for
-        # the answer to the repeated instruction, its sample would get a time stamp that is 8 ms too late.
-        spare = max(0, min(_PADS - 1, self.table.size - address - length))
-
-        def instruction() -> tuple[bytes, int]:
-            padded = length + self._pad % (spare + 1)
-            return self.form.read(servo_ids, address, padded), padded
-
-        answers, transaction = self._exchange(instruction, servo_ids, what, despite_error)
-        return [answer.data[:length] for answer in answers], transaction
+        packet = self.form.read(servo_ids, address, length)
+        answers, transaction = self._exchange(packet, length, servo_ids, what, despite_error)
+        return [answer.data for answer in answers], transaction
 
     def read_counts(
         self, servo_ids: Sequence[int], registers: Sequence[Register], what: str
@@ -123,9 +109,9 @@ class ServoLink(ABC):
 
     def write(self, servo_id: int, register: Register, value: int) -> Transaction:
         """Write a register, and wait for the answer; some servos confirm a value that they refuse, see `set`."""
-        moves = self._moves(register, (value,))
+        moves = self.family.moves(register, (value,))
         packet, what = self.form.write(servo_id, register, value), f"write of {value} to {register.name}"
-        return self._exchange(lambda: (packet, 0), (servo_id,), what, moves=moves)[1]
+        return self._exchange(packet, 0, (servo_id,), what, moves=moves)[1]
 
     def set(self, servo_id: int, register: Register, value: int) -> None:
         """Write a register if it holds another value; raise HardwareLost if the servo does not keep it."""
@@ -145,19 +131,19 @@ class ServoLink(ABC):
 
     def write_each(self, register: Register, values: Mapping[int, int]) -> Transaction:
         """Write a register of several servos, id -> value in counts, with one instruction that no servo answers."""
-        moves = self._moves(register, values.values())
+        moves = self.family.moves(register, values.values())
         packet = self.form.write_each(register, values)
-        return self._exchange(lambda: (packet, 0), (), f"write of {register.name}", moves=moves)[1]
+        return self._exchange(packet, 0, (), f"write of {register.name}", moves=moves)[1]
 
-    def ping(self, servo_id: int) -> bytes:
-        """Return the data of a servo's answer to a ping, also with an error; raise HardwareLost without an answer."""
-        packet, who, length = self._ping(servo_id)
-        return self._exchange(lambda: (packet, length), who, "ping", despite_error=True)[0][0].data
+    def ping(self, servo_id: int) -> None:
+        """Raise HardwareLost if a servo does not answer a ping; an error in its answer is ignored."""
+        self._exchange(self._ping(servo_id), self.form.ping_bytes, (servo_id,), "ping", despite_error=True)
 
     def scan(self) -> list[int]:
         """Return the ids below 20 that answer a ping of their own; a scan of all ids would take 2 s."""
         with self.hold():
-            return [i for i in range(_SCANNED) if self._attempt(*self._ping(i)) is not None]
+            length = self.form.ping_bytes
+            return [i for i in range(_SCANNED) if self._attempt(self._ping(i), (i,), length) is not None]
 
     def force(self, servo_id: int, register: Register, value: int) -> bool:
         """Write a register despite lock, missing answers and errors; return whether it reads back. Never raises."""
@@ -220,7 +206,8 @@ class ServoLink(ABC):
 
     def _exchange(
         self,
-        instruction: Callable[[], tuple[bytes, int]],
+        packet: bytes,
+        length: int,
         servo_ids: Sequence[int],
         what: str,
         despite_error: bool = False,
@@ -229,7 +216,7 @@ class ServoLink(ABC):
         """Repeat an instruction until all servos have answered, or the bus counts as lost.
 
         Args:
-            instruction: Returns its bytes, and the number of data bytes of each answer.
+            length: Number of data bytes of each answer.
             servo_ids: The servos that answer, in this order.
             despite_error: Whether errors in the answers are ignored.
             moves: Whether it could move a motor, or switch a torque on.
@@ -252,16 +239,15 @@ class ServoLink(ABC):
                 # Show the guardian that this process lives, as often as the bus is used.
                 if self.guardian is not None:
                     self.guardian.beat()
-                packet, length = instruction()
                 # Checked with the lock: whoever takes the torque off gets it afterwards.
                 if moves and self.at_rest:
                     raise SafetyStop(f"no {what} is sent: the torque was taken off", hint="enable the device again")
                 try:
                     answers = None
                     # A write never waits for an empty line: it may take the torque off.
-                    if not length or length not in self._unheard or self._passed(servo_ids[-1]):
+                    if not length or not self._unsettled or self._drain(servo_ids[-1]):
                         answers = self._attempt(packet, servo_ids, length)
-                        self._unheard |= {length} if answers is None else set()
+                        self._unsettled |= length > 0 and answers is None
                 except OSError as failure:
                     self._require_watching()
                     raise HardwareLost(f"{self.config.port} failed during {request}: {failure}") from failure
@@ -275,19 +261,18 @@ class ServoLink(ABC):
                         self._silent_ns = None
                     late_ns = self._count_answer(now_ns, self._wire_ns(packet, servo_ids, length))
                     break
-                # An answer is missing: ask for more bytes next time, and give up after the longest silence.
+                # An answer is missing: ask again, and give up after the longest silence.
                 losses += 1
                 self._lost += 1
                 self._missed += 1
                 self._silent_ns = silent_ns = (silent_ns[0], now_ns)
-                self._pad = (self._pad + 1) % _PADS
                 self._require_heard(request, 1e-9 * (silent_ns[1] - silent_ns[0]))
                 self._retries += 1
             transaction = Transaction(self._sent_ns, began_ns - requested_ns, now_ns - began_ns, losses, late_ns)
         # Outside of the lock, as the error's cause is read from the servo.
         for answer in answers:
             if answer.error and not despite_error:
-                self.require_fine(answer, what)
+                raise self._failure(answer, what)
         return answers, transaction
 
     def _repeat_off(self, pause_s: float) -> None:
@@ -299,21 +284,21 @@ class ServoLink(ABC):
                     self.clock.sleep(pause_s)
                 self.port.write(self.off_packet)
 
-    def _passed(self, servo_id: int) -> bool:
-        """Read as many bytes as no other read; the line keeps the order, so no late answer comes after them."""
-        # Ask the last servo that is read: those before it have answered by then. Each barrier has another length: with
-        # two lengths in turn, answers that were 50 ms late ended barriers of later reads.
-        self._barriers += 1
-        begin = self.table.torque.address
-        length = _BARRIER_BYTES + self._barriers % (self.table.size - begin - _BARRIER_BYTES + 1)
-        query = self.form.read((servo_id,), begin, length)
-        if self._attempt(query, (servo_id,), length) is None:
-            return False
-        self._unheard.clear()
-        return True
+    def _drain(self, servo_id: int) -> bool:
+        """Let answers that are late pass: read as many bytes as no other read; the line keeps the order.
 
-    def _ping(self, servo_id: int) -> tuple[bytes, tuple[int], int]:
-        return self.form.build(servo_id, Instruction.PING), (servo_id,), self.ping_bytes
+        Taken for the answer to a repeated read, a late one would give its sample a time stamp that is 8 ms too late.
+        """
+        # Ask the last servo that is read: those before it have answered by then. Each of these reads has another
+        # length: with two lengths in turn, answers that were 50 ms late ended later ones.
+        self._drains += 1
+        begin = self.family.torque.address
+        length = _BARRIER_BYTES + self._drains % (self.family.size - begin - _BARRIER_BYTES + 1)
+        self._unsettled = self._attempt(self.form.read((servo_id,), begin, length), (servo_id,), length) is None
+        return not self._unsettled
+
+    def _ping(self, servo_id: int) -> bytes:
+        return self.form.build(servo_id, Instruction.PING)
 
     def _wire_ns(self, packet: bytes, servo_ids: Sequence[int], length: int) -> int:
         """Return the time of an instruction and its answers on the wire [ns]."""
@@ -394,7 +379,3 @@ class ServoLink(ABC):
         """Raise SafetyStop if the guardian has taken over: it reads answers that are then missing here."""
         if self.guardian is not None:
             self.guardian.require_watching()
-
-    def _moves(self, register: Register, values: Iterable[int]) -> bool:
-        """Whether a write could move a motor, or switch its torque on."""
-        return register in self.table.goals or (register == self.table.torque and any(values))

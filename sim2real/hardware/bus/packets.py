@@ -1,12 +1,15 @@
 """Packets on a half-duplex bus of servos: the shared part, and the abstract part that each family defines."""
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import ClassVar, Final, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, Final, NamedTuple
 
-from sim2real.hardware.bus.registers import Register
+if TYPE_CHECKING:
+    from sim2real.hardware.bus.registers import Register
 
 BROADCAST_ID: Final = 0xFE
 
@@ -61,6 +64,7 @@ class PacketFormat(ABC):
         address_bytes: Number of bytes of an address, and of a length in an instruction.
         refusals: Bits of the error byte of a refused instruction; such an answer has no data.
         off_errors: Possible error bytes of an answer that confirms that torque is off.
+        ping_bytes: Number of data bytes of the answer to a ping.
     """
 
     header: ClassVar[bytes]
@@ -69,6 +73,7 @@ class PacketFormat(ABC):
     address_bytes: ClassVar[int]
     refusals: ClassVar[int] = 0
     off_errors: ClassVar[tuple[int, ...]] = (0,)
+    ping_bytes: ClassVar[int] = 0
 
     @abstractmethod
     def frame(self, servo_id: int, body: bytes) -> bytes:

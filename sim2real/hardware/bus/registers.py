@@ -1,9 +1,13 @@
-"""The registers of a servo's memory, for all families: their addresses, and the encoding of their numbers."""
+"""A family of servos as a table: the registers of their memory, their models, and what they expect at the start."""
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Final
+
+from sim2real.hardware.bus.packets import PacketFormat
+from sim2real.hardware.device import Alone, WithoutHost
 
 TWOS_COMPLEMENT: Final = -1
 RETURN_DELAY_UNIT_S: Final = 2e-6
@@ -21,6 +25,7 @@ class Register:
         default: Value after power-up [counts].
         sign: Number of the sign bit beside a magnitude; or `TWOS_COMPLEMENT`; None: never negative.
         eeprom: Whether its value survives a loss of power.
+        unit: One count, in SI units.
     """
 
     name: str
@@ -32,11 +37,16 @@ class Register:
     sign: int | None = None
     writable: bool = False
     eeprom: bool = False
+    unit: float = 1.0
 
     @property
     def end(self) -> int:
         """The address after the register's last byte."""
         return self.address + self.size
+
+    def count(self, value: float) -> int:
+        """Return the count nearest to a value in SI units."""
+        return round(value / self.unit)
 
     def decode(self, data: bytes | bytearray) -> int:
         """Return the value of `size` bytes [counts]."""
@@ -57,34 +67,100 @@ eeprom = partial(Register, writable=True, eeprom=True)
 
 
 @dataclass(frozen=True)
-class MemoryTable:
-    """The memory of a servo, with the registers that drivers of all families use.
+class ServoModel:
+    """A servo model, and its reaction to the death of the computer that controls it.
 
     Args:
-        named: The values of a module of registers; values of other types are ignored.
-        torque: The register that holds 0 while torque is off.
-        goals: The registers that can move the motor while torque is on.
-        return_delay: The register of the time between instruction and answer, in units of 2 us.
-        firmware: The registers of the firmware's version, major number first.
-        voltage: The register of the supply voltage, in units of 0.1 V.
-        temperature: The register of the motor's temperature [deg C].
+        stops_alone: Whether it stops when its own bus watchdog trips; None: it has no watchdog.
+        source: Where that is documented, or who measured it.
     """
 
+    name: str
+    stops_alone: bool | None
+    source: str
+
+    def without_host(self, watchdog_s: float, motors: tuple[str, ...] = ()) -> WithoutHost:
+        """Return the servo's reaction to the death of its host; a ``watchdog_s`` of 0 switches its bus watchdog off."""
+        if self.stops_alone is None or not watchdog_s:
+            why = "it has no bus watchdog" if self.stops_alone is None else "its bus watchdog is off"
+            return WithoutHost(self.name, motors, Alone.GOES_ON, math.inf, self.source, why)
+        does = Alone.STOPS if self.stops_alone else Alone.GOES_ON
+        return WithoutHost(self.name, motors, does, watchdog_s, self.source)
+
+
+@dataclass(frozen=True)
+class Family:
+    """Servos with one packet format and one memory table. Driver and emulator are made of it.
+
+    Args:
+        name: Their name in messages.
+        named: The registers, e.g. the values of a module; values of other types are ignored.
+        size: Number of bytes of the memory.
+        baud_rates: Bits per second that they support.
+        torque: Holds 0 while torque is off.
+        goal: The goal of the position controller.
+        goals: All registers that can move the motor while torque is on.
+        limits: The lowest and the highest position that they follow; both 0: no limit.
+        mode: The operating mode.
+        return_delay: Time between instruction and answer, in units of 2 us.
+        controller: P gain, D gain, and speed of the setpoint.
+        firmware: The firmware's version, major number first.
+        voltage: The supply voltage, in units of 0.1 V.
+        temperature: The motor's temperature [deg C].
+        begin: Values that are written at `open`, such as "answer every instruction".
+        watched: Neighbouring registers that `check` compares with the values that were written.
+        full_rad: Position error times P gain at which the controller gives full torque [rad].
+        models: Model number -> model.
+        watchdog: Longest silence of the host, after which their own watchdog trips and the register is below 0; 0: off;
+            None: they have none.
+    """
+
+    name: str
+    form: PacketFormat
     named: Iterable[object]
     size: int
+    baud_rates: tuple[int, ...]
     torque: Register
+    goal: Register
     goals: tuple[Register, ...]
+    limits: tuple[Register, Register]
+    mode: Register
     model_number: Register
     servo_id: Register
     return_delay: Register
     position: Register
+    velocity: Register
+    load: Register
+    controller: tuple[Register, Register, Register]
     firmware: tuple[Register, ...]
     voltage: Register
     temperature: Register
+    begin: Mapping[Register, int]
+    watched: tuple[Register, ...]
+    full_rad: float
+    models: Mapping[int, ServoModel]
+    watchdog: Register | None = None
     registers: dict[int, Register] = field(init=False)
     """Address -> register."""
 
     def __post_init__(self) -> None:
-        """Keep the registers alone."""
         registers = sorted((r for r in self.named if isinstance(r, Register)), key=lambda r: r.address)
         object.__setattr__(self, "registers", {r.address: r for r in registers})
+
+    @property
+    def longest_silence_s(self) -> float:
+        """The longest time that the watchdog can be set to [s]."""
+        return math.inf if self.watchdog is None else self.watchdog.maximum * self.watchdog.unit
+
+    def moves(self, register: Register, values: Iterable[int]) -> bool:
+        """Return whether a write could move a motor, or switch its torque on."""
+        return register in self.goals or (register == self.torque and any(values))
+
+
+def reaction_table(models: Iterable[ServoModel]) -> str:
+    """Return the Markdown table of models and their reactions in docs/guides/safety.md."""
+    rows = [
+        (m.name, m.without_host(0.1).words.replace("after 0.1 s", "after `servo_watchdog_s`"), m.source) for m in models
+    ]
+    lines = [("Servo", "Reaction when the computer dies", "Source"), ("---",) * 3, *rows]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)

@@ -1,71 +1,213 @@
-"""Servos of any family on one bus: the guardian that watches them, and every way in which their torque goes off."""
+"""Servos of any family on one bus, as a device, and every way in which their torque goes off."""
 
 import atexit
 import logging
-from collections.abc import Iterable, Iterator, Sequence
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Final, Generic, Self, TypeVar
+from dataclasses import dataclass
+from typing import ClassVar, Final
+
+import numpy as np
 
 from sim2real.errors import HardwareLost, SafetyStop, UsageError
 from sim2real.hardware.bus.link import ServoLink
-from sim2real.hardware.bus.models import ServoModel
-from sim2real.hardware.bus.packets import BROADCAST_ID, Instruction
-from sim2real.hardware.bus.port import LinkConfig
+from sim2real.hardware.bus.packets import BROADCAST_ID, Answer, Instruction
+from sim2real.hardware.bus.port import BusConfig
+from sim2real.hardware.bus.registers import Family, Register, ServoModel
 from sim2real.hardware.clock import SYSTEM_CLOCK, Clock
-from sim2real.hardware.device import Counters, WithoutHost
+from sim2real.hardware.device import POSITION, CommandKind, Counters, Device, Reading, Transaction, WithoutHost
+from sim2real.hardware.safety.following import MOST_SHARE, RESPONSE_S, SLOW_RAD_S, Following
 
 _LOGGER = logging.getLogger(__name__)
 _SHARED_PINGS: Final = 3
+_BEYOND_RAD: Final = 0.1
+"""Largest distance of a joint from its range when torque goes on [rad]; it is pulled back to the end of the range."""
 
-L = TypeVar("L", bound=ServoLink)
+
+@dataclass(frozen=True)
+class ServoJoint:
+    """A joint that a servo moves: angle = direction * gear * (count - zero_count) * 2 pi / counts.
+
+    Args:
+        zero_count: The servo's count at the joint's zero [counts].
+        direction: 1, or -1 if the joint's angle falls as the count rises.
+        low_count: Lowest count of the joint's range; the servo's own limits may narrow it.
+        high_count: Highest count.
+        gear: Turns of the joint per turn of the servo [1].
+        homing_offset: Offset in the servo for which a calibration holds, checked at `open`, as are the servo's limits;
+            None: there is no calibration.
+        counts: Counts of a revolution.
+    """
+
+    name: str
+    servo_id: int
+    zero_count: float = 2048.0
+    direction: int = 1
+    low_count: int = 0
+    high_count: int = 4095
+    gear: float = 1.0
+    homing_offset: int | None = None
+    counts: int = 4096
+
+    def __post_init__(self) -> None:
+        if self.direction not in (1, -1):
+            raise UsageError(f"joint {self.name!r}: direction = {self.direction} is neither 1 nor -1")
+        if not 0.0 < self.gear < math.inf:
+            raise UsageError(f"joint {self.name!r}: gear = {self.gear} must be larger than 0")
+        if not 0 <= self.low_count < self.high_count < self.counts:
+            raise UsageError(
+                f"joint {self.name!r}: {self.low_count} to {self.high_count} counts is not a range within 0 to "
+                f"{self.counts - 1}"
+            )
+
+    @property
+    def rad_per_count(self) -> float:
+        """Change of the angle with the count [rad]."""
+        return self.direction * self.gear * 2.0 * math.pi / self.counts
+
+    @property
+    def range_rad(self) -> tuple[float, float]:
+        """Lowest and highest angle [rad]."""
+        ends = sorted(self.angle(count) for count in (self.low_count, self.high_count))
+        return ends[0], ends[1]
+
+    def angle(self, count: float) -> float:
+        """Return the joint's angle [rad] at a count of its servo."""
+        return (count - self.zero_count) * self.rad_per_count
+
+    def count(self, angle_rad: float) -> int:
+        """Return the servo's count nearest to an angle of the joint [rad]."""
+        return round(self.zero_count + angle_rad / self.rad_per_count)
 
 
-class GuardedServos(Generic[L]):
-    """Servos on a bus, and the guardian that watches them. All methods may be called from any thread.
+class Drive(ABC):
+    """The settings with which servos follow one kind of command.
+
+    Attributes:
+        mode: Value of the family's register `mode`.
+        goal: The register of the command.
+        count_unit: A count of it, in the unit of the command; for positions, the joints say it.
+        speed_rad_s: Speed at which a setpoint moves to its goal.
+    """
+
+    kind: ClassVar[CommandKind] = POSITION
+    mode: ClassVar[int]
+    goal: ClassVar[Register]
+    count_unit: float = 1.0
+    speed_rad_s: float = math.inf
+
+    @abstractmethod
+    def registers(self) -> dict[Register, int]:
+        """Return the registers that the settings are in, and their values [counts]."""
+
+    def joints_of(self, ids: Sequence[int]) -> tuple[ServoJoint, ...]:
+        """Return the joints of servos without a calibration."""
+        return tuple(ServoJoint(f"servo {i}", i) for i in ids)
+
+
+def within(values: dict[Register, int]) -> dict[Register, int]:
+    """Return values of registers; raise UsageError for one that its register cannot hold."""
+    for register, value in values.items():
+        if not register.minimum <= value <= register.maximum:
+            raise UsageError(f"{register.name} = {value} is outside [{register.minimum}, {register.maximum}]")
+    return values
+
+
+class Servos(Device):
+    """Servos of one family on one port, each moving one joint, commanded in the unit of their drive.
 
     The torque is taken off by `close`, when the context is left, and when the interpreter exits; on a signal only if
     its handler calls `make_safe`. If this process is killed or hangs, the guardian takes the torque off: a separate
     process that is started before torque goes on.
 
+    A subclass is a family: its table, and where it differs, `failure`, `model`, `settings`, `prepare` and
+    `speed_unit`. Servos may not report that they refuse a value, so every setting is read back; EEPROM registers are
+    written only if their value differs, as writing wears them out.
+
+    Args:
+        joints: The joints, or the ids of servos without a calibration.
+
     Attributes:
         models: Id -> model of the servos that answered; `close` takes their torque off.
         armed: Whether torque was switched on.
         halted: Whether torque stays off because `make_safe` or `close` was called.
+
+    Raises:
+        UsageError: There are no joints, or two with one servo; or the family has not such a baud rate or watchdog.
     """
 
-    link_type: type[L]
-    """Makes the link from a configuration."""
+    family: ClassVar[Family]
 
-    def __init__(self, config: LinkConfig, ids: Sequence[int] = ()) -> None:
-        self.config = config
-        self.ids: tuple[int, ...] = ()
+    def __init__(self, config: BusConfig, joints: Sequence[ServoJoint | int], drive: Drive) -> None:
+        family, rates = self.family, self.family.baud_rates
+        if config.baud_rate not in rates:
+            raise UsageError(
+                f"baud rate {config.baud_rate} is none of a {family.name} servo's. Available: {sorted(rates)}"
+            )
+        if config.silence_s > family.longest_silence_s:
+            raise UsageError(f"silence_s = {config.silence_s} is outside [0, {family.longest_silence_s}]")
+        plain = {j.servo_id: j for j in drive.joints_of([j for j in joints if isinstance(j, int)])}
+        self.config, self.drive = config, drive
+        self.joints = tuple(plain[j] if isinstance(j, int) else j for j in joints)
+        self.ids = tuple(joint.servo_id for joint in self.joints)
+        if not self.ids or len(set(self.ids)) < len(self.ids) or not all(0 <= i < BROADCAST_ID for i in self.ids):
+            raise UsageError(
+                f"servos {list(self.ids)}: there must be at least one, each with an id of its own, from 0 to "
+                f"{BROADCAST_ID - 1}"
+            )
+        # Built here, as make_safe must not need any time.
+        self._off_packet = family.form.write_each(family.torque, dict.fromkeys(self.ids, 0))
         self.models: dict[int, ServoModel] = {}
-        self.armed = False
-        self.halted = False
-        self._link: L | None = None
-        self.watch(ids)
-
-    def __enter__(self) -> Self:
-        """Return the open servos, with torque off."""
-        self.open()
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        """Take the torque off and close the port."""
-        self.close()
-
-    def open(self) -> None:
-        """Open the port; raise HardwareLost if that cannot be done."""
-        if self._link is not None and not self._link.closed:
-            raise UsageError("the servos are open already", hint="close them first")
         self.armed = self.halted = False
-        self.models = {}
-        self._link = self.link_type(self.config)
-        self._link.off_packet = self._off_packet
-        atexit.register(self.close)
+        self._link: ServoLink | None = None
+        # Counts of goals: zero, unit of the command, and range; `open` narrows it to the servos' own.
+        joints_, n, positions = self.joints, len(self.ids), drive.kind is POSITION
+        self._at_zero = np.array([joint.zero_count for joint in joints_])
+        self._rad = np.array([joint.rad_per_count for joint in joints_])
+        self._zero = self._at_zero if positions else np.zeros(n)
+        self._unit = self._rad if positions else np.full(n, drive.count_unit)
+        self._low = np.array([j.low_count if positions else drive.goal.minimum for j in joints_])
+        self._high = np.array([j.high_count if positions else drive.goal.maximum for j in joints_])
+        self._goals = np.zeros(n, np.int64)
+
+    # -- what differs between families
+
+    def failure(self, answer: Answer, what: str) -> Exception:
+        """Return the error that an answer to the instruction ``what`` reports: SafetyStop if the servo has stopped."""
+        return SafetyStop(f"servo {answer.servo_id} reports the error {answer.error:#x} at the {what}")
+
+    def model(self, servo_id: int, number: int) -> ServoModel:
+        """Return the model of a servo's number; raise HardwareLost for one that the table does not hold for."""
+        if number not in self.family.models:
+            names = ", ".join(f"{model.name} ({n})" for n, model in self.family.models.items())
+            raise HardwareLost(f"servo {servo_id} is model {number}, which is not supported. Available: {names}")
+        return self.family.models[number]
+
+    def settings(self, servo_id: int) -> dict[Register, int]:
+        """Return the registers of a servo's drive, and their values [counts]."""
+        del servo_id
+        return self.drive.registers()
+
+    def prepare(self, joint: ServoJoint) -> None:
+        """Read or write what the settings depend on, with torque off."""
+        del joint
+
+    def speed_unit(self, servo_id: int) -> float:
+        """Return a count of a servo's measured speed [rad/s]."""
+        del servo_id
+        return self.family.velocity.unit
+
+    # -- properties
 
     @property
-    def link(self) -> L:
+    def commanded(self) -> CommandKind:
+        """The quantity of the drive's commands."""
+        return self.drive.kind
+
+    @property
+    def link(self) -> ServoLink:
         """The link, once it is open."""
         if self._link is None:
             raise HardwareLost(f"the servos on {self.config.port} are not open", hint="call open first")
@@ -91,52 +233,42 @@ class GuardedServos(Generic[L]):
         """Counts of the transactions since `open`."""
         return Counters() if self._link is None else self._link.counters
 
-    def require_watching(self) -> None:
-        """Raise SafetyStop if the guardian has taken over, or has died."""
-        if self._link is not None and self._link.guardian is not None:
-            self._link.guardian.require_watching()
-
     @property
     def guardian_pid(self) -> int | None:
         """Process id of the guardian; None before it is started."""
         guardian = None if self._link is None else self._link.guardian
         return None if guardian is None else guardian.pid
 
-    def watch(self, servo_ids: Sequence[int]) -> None:
-        """Let `make_safe` and the guardian act on these servos from now on."""
-        if not all(0 <= i < BROADCAST_ID for i in servo_ids):
-            raise UsageError(f"servos {list(servo_ids)}: an id is a number from 0 to {BROADCAST_ID - 1}")
-        form, torque = self.link_type.form, self.link_type.table.torque
-        self.ids = tuple(servo_ids)
-        # Built here, as make_safe must not need any time.
-        self._off_packet = form.write_each(torque, dict.fromkeys(self.ids, 0)) if self.ids else b""
-        if self._link is not None:
-            self._link.off_packet = self._off_packet
+    @property
+    def _watchdog_count(self) -> int:
+        """Value of the watchdog's register: `silence_s` in its unit, at least 1 unless it is 0 (off)."""
+        watchdog = self.family.watchdog
+        return max(1, watchdog.count(self.silence_s)) if watchdog is not None and self.silence_s > 0.0 else 0
 
-    def find(self, servo_id: int, whose: str = "") -> bytes:
-        """Return the data of a servo's answer to a ping.
+    # -- from open to close
 
-        Raises:
-            HardwareLost: It does not answer, the message has the ids that do; or two servos have this id.
-        """
-        # Ping once for the data.
+    def open(self) -> None:
+        """Open the port, find the servos, take their torque off and write their settings."""
+        if self._link is not None and not self._link.closed:
+            raise UsageError("the servos are open already", hint="close them first")
+        self.armed = self.halted = False
+        self.models = {}
+        self._link = ServoLink(self.config, self.family, self.failure)
+        self._link.off_packet = self._off_packet
+        atexit.register(self.close)
         try:
-            data = self.link.ping(servo_id)
-        except HardwareLost as error:
-            raise HardwareLost(
-                f"servo {servo_id}{whose} does not answer on {self.config.port} at {self.config.baud_rate} baud. "
-                f"Available: {sorted(self.link.scan())}",
-                hint="check power, cable, id and baud rate; set a USB adapter's latency timer to 1 ms; two servos of "
-                "one id garble each other's answers: connect one at a time",
-            ) from error
-        # Ping several times for a second servo of the same id: a late answer to an earlier ping does not repeat.
-        ping, wait_s = self.link.form.build(servo_id, Instruction.PING), 2.0 * self.config.reply_timeout_s
-        if all(self.link.answering(ping, wait_s).count(servo_id) > 1 for _ in range(_SHARED_PINGS)):
-            raise HardwareLost(
-                f"two servos on {self.config.port} have the id {servo_id}{whose}: both answer, and both would obey",
-                hint="connect one of them at a time, and give each an id of its own",
-            )
-        return data
+            for joint in self.joints:
+                self._find(joint)
+                if not self.release(joint.servo_id):
+                    raise HardwareLost(f"servo {joint.servo_id} does not confirm that its torque is off")
+                for register, value in {**self.family.begin, self.family.mode: self.drive.mode}.items():
+                    self._link.set(joint.servo_id, register, value)
+                self.prepare(joint)
+                self._write(joint.servo_id, self.settings(joint.servo_id))
+                self._narrow(joint)
+        except BaseException:
+            self.close()
+            raise
 
     def without_host(self) -> tuple[WithoutHost, ...]:
         """Return the reaction of each model on this bus to the death of this process."""
@@ -147,36 +279,127 @@ class GuardedServos(Generic[L]):
 
     def facts(self) -> dict[str, dict[str, str]]:
         """Return firmware, supply voltage and temperature of each servo; see `Device.facts`."""
-        link, table = self.link, self.link.table
+        link, family = self.link, self.family
         facts: dict[str, dict[str, str]] = {"firmware": {}, "voltage": {}, "temperature": {}}
         # An error of a servo, such as an alarm, does not keep its facts from the log.
         for servo_id, motor in zip(self.ids, self.motors, strict=True):
-            numbers = [link.read(servo_id, r, despite_error=True) for r in (*table.firmware, table.voltage)]
+            numbers = [link.read(servo_id, r, despite_error=True) for r in (*family.firmware, family.voltage)]
             facts["firmware"][motor] = ".".join(map(str, numbers[:-1]))
             facts["voltage"][motor] = f"{0.1 * numbers[-1]:.1f} V"
-            facts["temperature"][motor] = f"{link.read(servo_id, table.temperature, despite_error=True)} °C"
+            facts["temperature"][motor] = f"{link.read(servo_id, family.temperature, despite_error=True)} °C"
         return facts
 
-    def guard(self) -> None:
-        """Arm the guardian before torque goes on; start it at the first call.
+    def reach(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the lowest and the highest command, each ``(n,)``: half a count beyond the range, as goals round."""
+        ends = (self._low - 0.5 - self._zero) * self._unit, (self._high + 0.5 - self._zero) * self._unit
+        return np.minimum(*ends), np.maximum(*ends)  # a direction of -1 swaps them
+
+    def following(self) -> Following | None:
+        """Return how joints follow their goals: near the limit, a servo pushes with nearly all of its torque."""
+        p_gain = self.settings(self.ids[0]).get(self.family.controller[0]) if self.models else None
+        if self.drive.kind is not POSITION or not p_gain:
+            return None
+        speed_rad_s = min(SLOW_RAD_S, 0.5 * self.drive.speed_rad_s)
+        return Following(MOST_SHARE * self.family.full_rad / p_gain, RESPONSE_S, speed_rad_s)
+
+    def enable(self) -> None:
+        """Write settings, which a servo may have lost, and goals at rest, and switch the torque on."""
+        self.armed = False
+        self._guard()
+        link, family = self.link, self.family
+        for i, joint in enumerate(self.joints):
+            servo_id = joint.servo_id
+            # A tripped watchdog refuses goals, so it is cleared first and armed last. The goal comes before torque:
+            # some firmware switches it on at this write, and holds the position.
+            if family.watchdog is not None:
+                link.write(servo_id, family.watchdog, 0)
+            self._write(servo_id, self.settings(servo_id))
+            self._goals[i] = self._goal_at_rest(i)
+            link.set(servo_id, self.drive.goal, int(self._goals[i]))
+            link.write(servo_id, family.torque, 1)
+            if family.watchdog is not None:
+                # Torque may set the goals to rest by itself.
+                link.write(servo_id, family.watchdog, self._watchdog_count)
+        self.armed = True
+        if link.at_rest:
+            self.armed = False
+            raise SafetyStop("torque stays off: the servos have been made safe", hint="open them again")
+
+    def rest(self) -> np.ndarray:
+        """Return the command that the servos follow since `enable`, ``(n,)``."""
+        return (self._goals - self._zero) * self._unit
+
+    def measure(self) -> Reading:
+        """Read angles [rad], speeds [rad/s] and loads, fractions of the largest, of all joints."""
+        family = self.family
+        state = sorted((family.position, family.velocity, family.load), key=lambda register: register.address)
+        counts, transaction = self.link.read_counts(self.ids, state, "read of the state")
+        position, speed, load = (
+            counts[:, state.index(register)] for register in (family.position, family.velocity, family.load)
+        )
+        sign = np.array([joint.direction for joint in self.joints])
+        gear = np.array([joint.gear for joint in self.joints])
+        return Reading(
+            position_rad=(position - self._at_zero) * self._rad,
+            velocity_rad_s=speed * np.array([self.speed_unit(i) for i in self.ids]) * sign * gear,
+            load=load * family.load.unit * sign,
+            transaction=transaction,
+        )
+
+    def command(self, values: np.ndarray) -> Transaction:
+        """Send goals ``(n,)`` [the unit of `commanded`]; one servo confirms its goal, several share one instruction.
 
         Raises:
-            SafetyStop: `make_safe` or `close` was called before, or the guardian has taken over.
-            HardwareLost: It does not start.
+            SafetyStop: A goal is not finite or out of range, a servo has stopped itself, or torque is off.
         """
-        if self.halted:
-            raise SafetyStop("torque stays off: the servos have been made safe", hint="open them again")
-        link = self.link
-        if self.config.guardian:
-            if link.guardian is None:
-                queries = link.form.torque_queries(link.table.torque, self.ids)
-                times_s = self.config.silence_s, self.config.reply_timeout_s
-                link.guardian = link.port.guardian(self._off_packet, queries, *times_s)
-            link.guardian.arm()
-        link.at_rest = False
-        if self.halted:  # in another thread, or by a signal
-            link.at_rest = True
-            raise SafetyStop("torque stays off: the servos have been made safe", hint="open them again")
+        # Refuse every goal before any is sent.
+        counts = self._zero + np.asarray(values, np.float64) / self._unit
+        possible = (counts >= self._low - 0.5 - 1e-6) & (counts <= self._high + 0.5 + 1e-6)
+        for i in np.flatnonzero(~possible).tolist():
+            (low, high), unit = (ends[i] for ends in self.reach()), self.drive.kind.unit
+            raise SafetyStop(
+                f"joint {self.joints[i].name!r}: {values[i]:.6g} {unit} is outside [{low:.6g}, {high:.6g}]"
+            )
+        goals = np.clip(np.rint(counts), self._low, self._high).astype(int).tolist()
+        if len(goals) == 1:
+            return self.link.write(self.ids[0], self.drive.goal, goals[0])
+        return self.link.write_each(self.drive.goal, dict(zip(self.ids, goals, strict=True)))
+
+    def check(self) -> None:
+        """Raise SafetyStop if a servo's watchdog has tripped, or it has lost its settings, as by a restart.
+
+        Several servos do not confirm their common goals, and a restarted one takes goals with its torque off.
+        """
+        if not self.armed:
+            return
+        family = self.family
+        counts, _ = self.link.read_counts(self.ids, family.watched, "read of the settings")
+        for servo_id, row in zip(self.ids, counts.tolist(), strict=True):
+            expected = {family.torque: 1, family.watchdog: self._watchdog_count, **self.settings(servo_id)}
+            for register, current in zip(family.watched, row, strict=True):
+                if register is family.watchdog and current < 0:
+                    raise self.tripped(servo_id)
+                # `armed` may have changed: another thread took the torque off.
+                if current != expected[register] and self.armed:
+                    raise SafetyStop(
+                        f"servo {servo_id} has lost its settings: {register.name} is {current}, not "
+                        f"{expected[register]}",
+                        hint="did its supply fail for a moment?",
+                    )
+
+    def tripped(self, servo_id: int) -> SafetyStop:
+        """Return the error for a servo whose bus watchdog has tripped."""
+        return SafetyStop(
+            f"the bus watchdog of servo {servo_id} has tripped: no instruction came for longer than silence_s",
+            hint="is this computer too busy, or does a loop stall? switching torque on again clears it",
+        )
+
+    def require_watching(self) -> None:
+        """Raise SafetyStop if the guardian has taken over, or has died."""
+        if self._link is not None and self._link.guardian is not None:
+            self._link.guardian.require_watching()
+
+    # -- the ways out
 
     def disable(self) -> None:
         """Switch the torque off: of all servos at once, then of each one until it confirms.
@@ -193,32 +416,13 @@ class GuardedServos(Generic[L]):
                     hint="cut their power",
                 )
 
-    def switched_on(self) -> None:
-        """Note that torque is on; raise SafetyStop if it was taken off meanwhile."""
-        self.armed = True
-        if self.link.at_rest:
-            self.armed = False
-            raise SafetyStop("torque stays off: the servos have been made safe", hint="open them again")
-
-    @contextmanager
-    def _unguarded(self) -> Iterator[None]:
-        """Take the torque off in this block: the guardian watches until its end, unless it has acted already."""
-        self.armed = False
-        self.link.at_rest = True
-        guardian = self.link.guardian
-        if guardian is not None and not guardian.settle():
-            guardian.disarm()  # it has taken over or died: take the torque off all the same
-        yield
-        if guardian is not None:
-            guardian.disarm()
-
     def make_safe(self) -> None:
         """Take the torque off without a lock and without waiting for answers: for signal handlers and watchdog threads.
 
         It takes no lock because the code that a signal interrupts may hold it. Torque cannot be switched on again
         afterwards.
         """
-        # In this order, as `guard` in another thread allows motion and then looks for `halted`, and `switched_on` sets
+        # In this order, as `_guard` in another thread allows motion and then looks for `halted`, and `enable` sets
         # `armed` and then looks for `at_rest`.
         self.halted = True
         if self._link is not None:
@@ -249,11 +453,99 @@ class GuardedServos(Generic[L]):
             guardian.end(confirmed=not unconfirmed)
         atexit.unregister(self.close)
 
+    def release(self, servo_id: int) -> bool:
+        """Take a servo's torque off, then its watchdog; return whether it has confirmed. Never raises."""
+        family = self.family
+        confirmed = self.link.force(servo_id, family.torque, 0)
+        if confirmed and family.watchdog is not None:
+            self.link.force(servo_id, family.watchdog, 0)
+        return confirmed
+
     def _release(self, servo_ids: Iterable[int]) -> list[int]:
         """Take the torque of all servos off at once; return those that do not confirm it. Never raises."""
         self.link.send_off()
         return [servo_id for servo_id in servo_ids if not self.release(servo_id)]
 
-    def release(self, servo_id: int) -> bool:
-        """Take a servo's torque off, and return whether it has confirmed; never raises."""
-        return self.link.force(servo_id, self.link.table.torque, 0)
+    @contextmanager
+    def _unguarded(self) -> Iterator[None]:
+        """Take the torque off in this block: the guardian watches until its end, unless it has acted already."""
+        self.armed = False
+        self.link.at_rest = True
+        guardian = self.link.guardian
+        if guardian is not None and not guardian.settle():
+            guardian.disarm()  # it has taken over or died: take the torque off all the same
+        yield
+        if guardian is not None:
+            guardian.disarm()
+
+    def _guard(self) -> None:
+        """Arm the guardian before torque goes on; start it at the first call."""
+        if self.halted:
+            raise SafetyStop("torque stays off: the servos have been made safe", hint="open them again")
+        link = self.link
+        if self.config.guardian:
+            if link.guardian is None:
+                queries = link.form.torque_queries(self.family.torque, self.ids)
+                times_s = self.config.silence_s, self.config.reply_timeout_s
+                link.guardian = link.port.guardian(self._off_packet, queries, *times_s)
+            link.guardian.arm()
+        link.at_rest = False
+        if self.halted:  # in another thread, or by a signal
+            link.at_rest = True
+            raise SafetyStop("torque stays off: the servos have been made safe", hint="open them again")
+
+    # -- one servo
+
+    def _find(self, joint: ServoJoint) -> None:
+        """Find a joint's servo and its model; raise HardwareLost if it does not answer, or two have its id."""
+        servo_id, link, whose = joint.servo_id, self.link, f" (joint {joint.name!r})"
+        try:
+            link.ping(servo_id)
+        except HardwareLost as error:
+            raise HardwareLost(
+                f"servo {servo_id}{whose} does not answer on {self.config.port} at {self.config.baud_rate} baud. "
+                f"Available: {sorted(link.scan())}",
+                hint="check power, cable, id and baud rate; set a USB adapter's latency timer to 1 ms; two servos of "
+                "one id garble each other's answers: connect one at a time",
+            ) from error
+        # Ping several times for a second servo of the same id: a late answer to an earlier ping does not repeat.
+        ping, wait_s = link.form.build(servo_id, Instruction.PING), 2.0 * self.config.reply_timeout_s
+        if all(link.answering(ping, wait_s).count(servo_id) > 1 for _ in range(_SHARED_PINGS)):
+            raise HardwareLost(
+                f"two servos on {self.config.port} have the id {servo_id}{whose}: both answer, and both would obey",
+                hint="connect one of them at a time, and give each an id of its own",
+            )
+        self.models[servo_id] = self.model(servo_id, link.read(servo_id, self.family.model_number, True))
+
+    def _narrow(self, joint: ServoJoint) -> None:
+        """Keep goals within the servo's own limits, which must hold a calibrated joint's whole range."""
+        low, high = (self.link.read(joint.servo_id, register) for register in self.family.limits)
+        if self.drive.kind is not POSITION or (low, high) == (0, 0):
+            return
+        if joint.homing_offset is not None and not low <= joint.low_count < joint.high_count <= high:
+            raise HardwareLost(
+                f"servo {joint.servo_id} (joint {joint.name!r}) goes from {low} to {high} counts only, its joint from "
+                f"{joint.low_count} to {joint.high_count}",
+                hint="calibrate again, or narrow the joint's range",
+            )
+        i = self.ids.index(joint.servo_id)
+        self._low[i], self._high[i] = max(joint.low_count, low), min(joint.high_count, high)
+
+    def _write(self, servo_id: int, values: Mapping[Register, int]) -> None:
+        for register, value in values.items():
+            self.link.set(servo_id, register, value)
+
+    def _goal_at_rest(self, i: int) -> int:
+        """Return the goal that keeps a joint at rest; raise SafetyStop if it is far outside its range."""
+        if self.drive.kind is not POSITION:
+            return 0
+        joint, low, high = self.joints[i], int(self._low[i]), int(self._high[i])
+        count = self.link.read(joint.servo_id, self.family.position)
+        goal = min(max(count, low), high)
+        if abs(goal - count) * abs(joint.rad_per_count) > _BEYOND_RAD:
+            ends = sorted((joint.angle(low), joint.angle(high)))
+            raise SafetyStop(
+                f"joint {joint.name!r} is at {joint.angle(count):.4g} rad, outside [{ends[0]:.4g}, {ends[1]:.4g}]",
+                hint="move it by hand, or calibrate again",
+            )
+        return goal

@@ -6,12 +6,11 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from sim2real.hardware.dynamixel import registers as dynamixel
-from sim2real.hardware.feetech import registers as feetech
+from sim2real.hardware import dynamixel, feetech
 
 if TYPE_CHECKING:
-    from sim2real.hardware.dynamixel.drive import PositionDrive
-    from sim2real.hardware.feetech.drive import StsDrive
+    from sim2real.hardware.dynamixel import PositionDrive
+    from sim2real.hardware.feetech import StsDrive
 
 
 @dataclass(frozen=True)
@@ -46,7 +45,7 @@ class DataSheet:
     @property
     def full_rad(self) -> float:
         """Position error at which the duty is full [rad]."""
-        return dynamixel.full_torque_error_rad(self.p_gain)
+        return dynamixel.FAMILY.full_rad / self.p_gain
 
     @property
     def gain(self) -> float:
@@ -56,7 +55,7 @@ class DataSheet:
     @property
     def drive(self) -> PositionDrive | StsDrive:
         """The drive with these settings, for the robot's device."""
-        from sim2real.hardware.dynamixel.drive import PositionDrive
+        from sim2real.hardware.dynamixel import PositionDrive
 
         return PositionDrive(self.p_gain, self.profile_rad_s)
 
@@ -72,11 +71,11 @@ class StsSheet(DataSheet):
     @property
     def full_rad(self) -> float:
         """Position error at which the duty is full [rad]."""
-        return feetech.full_torque_error_rad(self.p_gain)
+        return feetech.FAMILY.full_rad / self.p_gain
 
     @property
     def drive(self) -> StsDrive:
         """The drive with these settings; its joints are those of a calibration."""
-        from sim2real.hardware.feetech.drive import StsDrive
+        from sim2real.hardware.feetech import StsDrive
 
         return StsDrive(self.p_gain, speed_rad_s=self.profile_rad_s)

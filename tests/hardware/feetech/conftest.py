@@ -2,8 +2,9 @@ import pytest
 from families import IDS
 
 from sim2real.emulation.feetech import StsEmulation
-from sim2real.hardware.feetech.calibration import CalibratedJoint as Joint
-from sim2real.hardware.feetech.device import StsConfig, StsServos
+from sim2real.hardware.bus.port import BusConfig
+from sim2real.hardware.bus.servos import ServoJoint as Joint
+from sim2real.hardware.feetech import StsServos
 
 STS = StsEmulation(return_delay_us=0)
 
@@ -21,7 +22,7 @@ def connect():
 
     def open_(robot, ids=IDS, joints=None, drive=None, **config):
         joints = joints or [Joint(f"joint{i}", i) for i in ids]
-        device = StsServos(StsConfig(robot.port, **{"silence_s": 1.0, **config}), joints, drive)
+        device = StsServos(BusConfig(robot.port, **{"silence_s": 1.0, **config}), joints, drive)
         devices.append(device)
         device.open()
         return device

@@ -6,9 +6,8 @@ from families import STS, VOLTS
 from sim2real.emulation.dynamixel import EmulatorConfig
 from sim2real.emulation.feetech import StsEmulation
 from sim2real.errors import HardwareLost, SafetyStop
-from sim2real.hardware.dynamixel import registers as reg
-from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
-from sim2real.hardware.feetech import registers as sts
+from sim2real.hardware import dynamixel as reg
+from sim2real.hardware import feetech as sts
 
 
 def answer_twice(robot, servo_id, place, join):
@@ -49,13 +48,12 @@ def test_a_late_answer_is_no_second_servo(serve, connect):
         connect(serve(config=StsEmulation(return_delay_us=0, seed=seed, late=0.3, late_s=0.012))).close()
 
 
-def test_dynamixels_too(serve):
+def test_dynamixels_too(serve, open_servos):
     robot = serve("FirstOrder", EmulatorConfig(), ids=(1, 2))
     answer_twice(robot, 1, 4, one_after_the_other)
-    with ServoBus(BusConfig(robot.port)) as bus:
-        assert bus.handshake({2: None}) == {2: 1060}
-        with pytest.raises(HardwareLost, match=r"two servos on .* have the id 1: both answer, and both would obey"):
-            bus.handshake({1: None})
+    open_servos(robot, (2,)).close()
+    with pytest.raises(HardwareLost, match=r"two servos on .* have the id 1 .*both answer, and both would obey"):
+        open_servos(robot)
 
 
 ALARMS = {

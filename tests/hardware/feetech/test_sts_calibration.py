@@ -4,8 +4,8 @@ import math
 import pytest
 
 from sim2real.errors import UsageError
-from sim2real.hardware.feetech.calibration import CalibratedJoint as Joint
-from sim2real.hardware.feetech.calibration import read_calibration
+from sim2real.hardware.bus.servos import ServoJoint as Joint
+from sim2real.hardware.calibration import read_calibration
 
 FOLLOWER = """{
     "shoulder_pan": {
@@ -75,14 +75,14 @@ def entry(**changes):
         ('{"elbow": {}, "elbow": {}}', "'elbow' is there twice"),
         ([1], "holds no motors by name"),
         ({}, "holds no motors by name"),
-        ({"elbow": 3}, "motor 'elbow' is no object"),
-        (entry(homing_offset=None), "motor 'elbow' lacks 'homing_offset'. Available: id, drive_mode"),
-        (entry(gear=2), "has an unknown 'gear'"),
-        (entry(id="1"), "id = '1' is no whole number in [0, 253]"),
-        (entry(drive_mode=True), "drive_mode = True is no whole number"),
-        (entry(homing_offset=2048), "homing_offset = 2048 is no whole number in [-2047, 2047]"),
-        (entry(range_max=4096), "range_max = 4096 is no whole number in [0, 4095]"),
-        (entry(range_min=100.5), "range_min = 100.5 is no whole number"),
+        ({"elbow": 3}, "Expected `object`, got `int`"),
+        (entry(homing_offset=None), "motor 'elbow': Object missing required field `homing_offset`"),
+        (entry(gear=2), "unknown field `gear`"),
+        (entry(id="1"), "Expected `int`, got `str` - at `$.id`"),
+        (entry(drive_mode=True), "Expected `int`, got `bool` - at `$.drive_mode`"),
+        (entry(homing_offset=2048), "Expected `int` <= 2047 - at `$.homing_offset`"),
+        (entry(range_max=4096), "Expected `int` <= 4095 - at `$.range_max`"),
+        (entry(range_min=100.5), "Expected `int`, got `float` - at `$.range_min`"),
         (entry(range_min=4000), "range_min = 4000 is not below range_max = 4000"),
         (entry() | {"wrist": entry()["elbow"]}, "motors 'elbow' and 'wrist' both have id 1"),
     ],

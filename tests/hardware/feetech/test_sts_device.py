@@ -9,11 +9,11 @@ from families import IDS
 from sim2real.emulation.feetech import StsEmulation
 from sim2real.emulation.truth import Kind
 from sim2real.errors import HardwareLost, SafetyStop, UsageError
+from sim2real.hardware import feetech as reg
+from sim2real.hardware.bus.port import BusConfig
+from sim2real.hardware.bus.servos import ServoJoint as Joint
 from sim2real.hardware.device import Alone, OperatingMode
-from sim2real.hardware.feetech import registers as reg
-from sim2real.hardware.feetech.calibration import CalibratedJoint as Joint
-from sim2real.hardware.feetech.device import StsConfig, StsServos
-from sim2real.hardware.feetech.drive import StsDrive
+from sim2real.hardware.feetech import StsDrive, StsServos
 from sim2real.hardware.registry import load_device
 
 
@@ -83,7 +83,7 @@ def test_goals_outside_the_range_are_refused(serve, connect, angle):
     ]
     device = connect(serve(), joints=joints)
     low, high = device.reach()
-    assert (low[0], high[0]) == joints[0].range_rad
+    assert (low[0], high[0]) == pytest.approx(joints[0].range_rad, abs=0.51 * reg.RAD_PER_COUNT)
     with pytest.raises(SafetyStop, match=r"joint 'pan': .* rad is outside"):
         device.command(np.array([angle, 0.0, 0.0]))
 
@@ -118,7 +118,7 @@ def test_what_they_do_without_a_host_is_said(serve, connect):
         ),
         (
             (reg.MAX_POSITION, 3000),
-            Joint("pan", 1),
+            Joint("pan", 1, homing_offset=0),
             "goes from 0 to 3000 counts only, its joint from 0 to 4095",
         ),
         (
@@ -170,7 +170,7 @@ def test_servos_by_the_devices_name(serve):
 
 
 def test_usage_that_makes_no_sense(serve, connect):
-    bus = StsConfig("/dev/ttyNONE")
+    bus = BusConfig("/dev/ttyNONE")
     with pytest.raises(UsageError, match=r"servos \[1, 1\]: there must be at least one, each with an id of its own"):
         StsServos(bus, [Joint("a", 1), Joint("b", 1)])
     with pytest.raises(HardwareLost, match=r"(?s)/dev/ttyNONE cannot be opened.*hint: serial ports here:"):
@@ -197,4 +197,4 @@ def test_settings_that_make_no_sense(bad):
 @pytest.mark.parametrize("bad", [{"baud_rate": 2_000_000}, {"silence_s": math.nan}, {"max_silence_s": -1.0}])
 def test_limits_that_make_no_sense(bad):
     with pytest.raises(UsageError, match=next(iter(bad)).replace("_", "[_ ]")):
-        StsConfig("/dev/null", **bad)
+        StsServos(BusConfig("/dev/null", **bad), [1])

@@ -1,11 +1,9 @@
-import math
-
 import pytest
 
+from sim2real.hardware import feetech as reg
 from sim2real.hardware.bus.packets import Instruction, Parser
 from sim2real.hardware.bus.registers import Register
-from sim2real.hardware.feetech import registers as reg
-from sim2real.hardware.feetech.protocol import HEADER, PROTOCOL, describe_alarms
+from sim2real.hardware.feetech import HEADER, PROTOCOL
 
 build = PROTOCOL.build
 
@@ -41,28 +39,6 @@ def test_packets_are_those_of_the_manuals_examples(packet, manual):
 def test_a_third_ff_is_no_id_and_a_length_below_2_no_packet():
     stream = b"\xff" + build(3, Instruction.PING) + HEADER + b"\x01\x01" + build(4, Instruction.PING)
     assert [p.servo_id for p, _ in Parser(PROTOCOL).feed(stream)] == [3, 4]
-
-
-@pytest.mark.parametrize(
-    ("register", "value", "data"),
-    [
-        (reg.PRESENT_POSITION, -3, b"\x03\x80"),
-        (reg.PRESENT_LOAD, -1000, b"\xe8\x07"),
-        (reg.HOMING_OFFSET, -1365, b"\x55\x0d"),
-        (reg.GOAL_SPEED, 1000, b"\xe8\x03"),
-        (reg.LOCK, 1, b"\x01"),
-    ],
-)
-def test_numbers_are_a_magnitude_and_a_sign_bit(register, value, data):
-    assert register.encode(value) == data
-    assert register.decode(data) == value
-
-
-def test_units():
-    assert reg.speed_unit_rad_s(reg.PHASE_COUNTS_PER_S) == pytest.approx(0.0146 * 2.0 * math.pi / 60.0, rel=4e-3)
-    assert reg.speed_unit_rad_s(0) == pytest.approx(0.732 * 2.0 * math.pi / 60.0, rel=1e-3)
-    assert describe_alarms(0) == "none"
-    assert describe_alarms(0b100001) == "input voltage, overload"
 
 
 def test_every_alarm_can_come_with_torque_off():

@@ -8,10 +8,10 @@ import pytest
 from sim2real.emulation.feetech import ProfiledPlant, StsEmulation
 from sim2real.emulation.truth import Kind
 from sim2real.errors import UsageError
+from sim2real.hardware import feetech as reg
 from sim2real.hardware.bus.packets import BROADCAST_ID, Instruction
 from sim2real.hardware.device import OperatingMode
-from sim2real.hardware.feetech import registers as reg
-from sim2real.hardware.feetech.protocol import PROTOCOL
+from sim2real.hardware.feetech import PROTOCOL
 
 MS = 1_000_000
 build = PROTOCOL.build

@@ -11,8 +11,8 @@ from typing import Final
 import numpy as np
 
 from sim2real.errors import HardwareLost
-from sim2real.hardware.feetech import registers as reg
-from sim2real.hardware.feetech.calibration import CalibratedJoint
+from sim2real.hardware import feetech as reg
+from sim2real.hardware.bus.servos import ServoJoint
 
 MOVED_RAD: Final = 0.3
 """Motion of a joint from which on it counts as moved [rad]."""
@@ -59,7 +59,7 @@ class HandMotion:
         middle: Counts in the middle pose, ``(joints,)``.
     """
 
-    joints: Sequence[CalibratedJoint]
+    joints: Sequence[ServoJoint]
     nudges: Sequence[Nudge]
     calibrated: bool
     directions: dict[str, int] = field(default_factory=dict)

@@ -1,0 +1,235 @@
+"""Calibration of Feetech servos in LeRobot's format: the servo, the zero and the range of each joint.
+
+    {"shoulder_pan": {"id": 1, "drive_mode": 0, "homing_offset": -1365, "range_min": 746, "range_max": 3477}, ...}
+
+The servo stores `homing_offset`, and subtracts it from its encoder's count; the range is in counts after that.
+LeRobot's angles in degrees are zero in the middle of the range (`motors_bus.py`, MotorNormMode.DEGREES), as here.
+Its `drive_mode` 1 mirrors the joint. A turn has 4095 counts for LeRobot, 4096 here: 0.02 % of an angle.
+"""
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import msgspec
+
+from sim2real.errors import HardwareLost, UsageError
+from sim2real.hardware import feetech as reg
+from sim2real.hardware.bus.link import ServoLink
+from sim2real.hardware.bus.port import BusConfig
+from sim2real.hardware.bus.servos import ServoJoint
+from sim2real.hardware.feetech import StsServos
+from sim2real.hardware.hand_motion import HandMotion
+
+_HINT: Final = "lerobot-calibrate writes one"
+_SHARE_OF_TRAVEL: Final = (0.75, 1.3)
+"""Least and largest range that a joint may have, as a share of its travel. Of SO-101 calibrations that are public the
+ranges are 0.81 to 1.27 of the description's travel, the most at grippers; those across the encoder's seam 1.6 to 3.3.
+"""
+_WHOLE_TURN: Final = 0.97
+"""Share of a revolution from which on a range is called a whole turn."""
+_PERIOD_S: Final = 0.02
+_LONGEST_S: Final = 600.0
+_CENTRE: Final = 2047
+"""Count of the middle of a joint's travel, as in LeRobot."""
+_SCANS: Final = 3
+_PATIENT_S: Final = 0.02  # answers of a USB adapter with a latency timer of 16 ms
+_Count = Annotated[int, msgspec.Meta(ge=0, le=reg.COUNTS_PER_REVOLUTION - 1)]
+
+
+class _Motor(msgspec.Struct, forbid_unknown_fields=True):
+    id: Annotated[int, msgspec.Meta(ge=0, le=253)]
+    drive_mode: Annotated[int, msgspec.Meta(ge=0, le=1)]
+    homing_offset: Annotated[int, msgspec.Meta(ge=reg.HOMING_OFFSET.minimum, le=reg.HOMING_OFFSET.maximum)]
+    range_min: _Count
+    range_max: _Count
+
+
+def read_calibration(path: Path | str, travel_rad: Mapping[str, float] | None = None) -> tuple[ServoJoint, ...]:
+    """Read LeRobot's calibration of an arm: `~/.cache/huggingface/lerobot/calibration/robots/so101_follower/*.json`.
+
+    The zero of a joint is the middle of its range, so a wrong range moves the zero. A joint that passes from count 4095
+    to count 0 while its range is recorded gets the range 0 to 4095, for any travel.
+
+    Args:
+        travel_rad: Joint -> angle from stop to stop [rad]; other joints may have any range, as one that turns freely.
+
+    Raises:
+        UsageError: There is no such file, it is not a calibration, or a range is far from the joint's travel.
+    """
+    # Read the file.
+    path = Path(path)
+    try:
+        motors = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=_unique)
+    except OSError as error:
+        raise UsageError(f"calibration file {path} cannot be read: {error.strerror}", hint=_HINT) from error
+    except (ValueError, RecursionError) as error:
+        raise UsageError(f"calibration file {path} is not valid JSON: {error}", hint=_HINT) from error
+    if not isinstance(motors, dict) or not motors:
+        raise UsageError(f"calibration file {path} holds no motors by name", hint=_HINT)
+    # Make the joints, in the order of the file, and check that they fit together.
+    joints = tuple(_joint(path, name, entry) for name, entry in motors.items())
+    by_id: dict[int, str] = {}
+    for joint in joints:
+        other = by_id.setdefault(joint.servo_id, joint.name)
+        if other != joint.name:
+            raise UsageError(
+                f"calibration file {path}: motors {other!r} and {joint.name!r} both have id {joint.servo_id}"
+            )
+        _check_range(path, joint, (travel_rad or {}).get(joint.name))
+    return joints
+
+
+def _check_range(path: Path, joint: ServoJoint, travel_rad: float | None) -> None:
+    """Refuse a range that is far from the joint's travel; None: any range is accepted."""
+    if travel_rad is None:
+        return
+    # Compare the recorded range with the joint's travel.
+    counts = joint.high_count - joint.low_count
+    travel_counts = travel_rad / abs(joint.rad_per_count)
+    least, most = (share * travel_counts for share in _SHARE_OF_TRAVEL)
+    if least <= counts <= most:
+        return
+    # Name the probable cause.
+    cause = (
+        "the joint passed from count 4095 to count 0 while its range was recorded"
+        if counts >= _WHOLE_TURN * reg.COUNTS_PER_REVOLUTION
+        else "the joint was not moved from stop to stop, or its counts passed from 4095 to 0, or it is another arm"
+    )
+    raise UsageError(
+        f"calibration file {path}: motor {joint.name!r} has the range {joint.low_count} to {joint.high_count}, "
+        f"{counts} counts, but from stop to stop the joint turns by about {round(travel_counts)} counts "
+        f"({math.degrees(travel_rad):.0f} degrees). The joint's zero, the middle of the range, would be wrong. "
+        f"Probable cause: {cause}",
+        hint="calibrate again: begin with every joint in the middle of its travel, then move each from stop to stop",
+    )
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return a JSON object as a dict; raise ValueError if it has a name twice, as one of them would be lost."""
+    names = [name for name, _ in pairs]
+    if duplicates := [name for name in names if names.count(name) > 1]:
+        raise ValueError(f"{duplicates[0]!r} is there twice")
+    return dict(pairs)
+
+
+def _joint(path: Path, name: str, entry: Any) -> ServoJoint:
+    where = f"calibration file {path}: motor {name!r}"
+    try:
+        motor = msgspec.convert(entry, _Motor)
+    except msgspec.ValidationError as error:
+        raise UsageError(f"{where}: {error}", hint=_HINT) from error
+    if motor.range_min >= motor.range_max:
+        raise UsageError(
+            f"{where}: range_min = {motor.range_min} is not below range_max = {motor.range_max}",
+            hint="was the joint moved while its range was recorded? calibrate again",
+        )
+    # The zero is the middle of the range, as in LeRobot.
+    middle, direction = (motor.range_min + motor.range_max) / 2, -1 if motor.drive_mode else 1
+    joint = name, motor.id, middle, direction, motor.range_min, motor.range_max
+    return ServoJoint(*joint, homing_offset=motor.homing_offset)
+
+
+def find_servos(port: str, joints: Mapping[int, str], baud_rate: int) -> tuple[ServoJoint, ...]:
+    """Return the robot's joints, with the homing offsets and limits that their servos hold. Writes nothing.
+
+    Args:
+        joints: Id -> joint, of all servos that the robot has.
+
+    Raises:
+        HardwareLost: No servo answers, they answer at another baud rate, or one is missing.
+    """
+    # Search the robot's own baud rate first.
+    for rate in sorted(reg.BAUD_RATES, key=lambda rate: rate != baud_rate):
+        config = BusConfig(port, rate, reply_timeout_s=_PATIENT_S, max_silence_s=1.0, guardian=False)
+        link = ServoLink(config, reg.FAMILY, lambda answer, what: HardwareLost(f"{what}: error {answer.error}"))
+        try:
+            # At the expected rate a servo that is missing is searched again, as answers may be lost.
+            answering: list[int] = []
+            for _ in range(_SCANS if rate == baud_rate else 1):
+                answering = sorted({*answering, *(i for i in link.scan() if i in joints or rate == baud_rate)})
+                if set(joints) <= set(answering):
+                    break
+            if answering and rate != baud_rate:
+                raise HardwareLost(
+                    f"the servos {answering} on {port} answer at {rate} baud, not at {baud_rate}",
+                    hint="lerobot-setup-motors gives each servo its id and its baud rate",
+                )
+            if missing := [f"{name!r} (id {i})" for i, name in joints.items() if answering and i not in answering]:
+                raise HardwareLost(
+                    f"no servo answers on {port} for the joint {' and '.join(missing)}. Ids that answer: {answering}",
+                    hint="check the cables between the servos; two servos of one id garble each other's answers: "
+                    "connect one at a time, and give it its id with lerobot-setup-motors",
+                )
+            if answering:
+                return tuple(_present(link, i, name) for i, name in joints.items())
+        finally:
+            link.close()
+    raise HardwareLost(
+        f"no servo answers on {port}, at any baud rate of {list(reg.BAUD_RATES)}",
+        hint="check that the servos have power, and that the port is that of the arm",
+    )
+
+
+def _present(link: ServoLink, servo_id: int, name: str) -> ServoJoint:
+    registers = (reg.MIN_POSITION, reg.MAX_POSITION, reg.HOMING_OFFSET)
+    low, high, offset = (link.read(servo_id, register, despite_error=True) for register in registers)
+    # A servo with the limits 0 and 0 turns without end.
+    low, high = (low, high) if low < high else (0, reg.COUNTS_PER_REVOLUTION - 1)
+    return ServoJoint(name, servo_id, low_count=low, high_count=high, homing_offset=offset)
+
+
+def follow(servos: StsServos, motion: HandMotion, show: Callable[[str], None]) -> None:
+    """Read the open servos, without torque, until the motion is complete.
+
+    Args:
+        show: Called with each new instruction.
+
+    Raises:
+        HardwareLost: The motion contradicts the calibration, or is not complete after 10 minutes.
+    """
+    clock, printed = servos.clock, ""
+    begun_ns = clock.now_ns()
+    while (now_s := 1e-9 * (clock.now_ns() - begun_ns)) < _LONGEST_S:
+        if motion.instruction != printed:
+            printed = motion.instruction
+            show(printed)
+        counts, _ = servos.link.read_counts(servos.ids, (reg.PRESENT_POSITION,), "read of the position")
+        if motion.feed(now_s, counts[:, 0]):
+            return
+        clock.sleep(_PERIOD_S)
+    raise HardwareLost(f"the arm was not moved as asked within {_LONGEST_S:.0f} s: {printed}")
+
+
+def write_calibration(servos: StsServos, motion: HandMotion, path: Path) -> None:
+    """Write the homing offsets into the servos, and the calibration file.
+
+    A servo's count is 2047 in the middle of its joint's travel; of a joint without stops in the middle pose.
+    """
+    link, entries = servos.link, {}
+    bounded = {n.joint for n in motion.nudges if n.travel_rad is not None}
+    for i, joint in enumerate(motion.joints):
+        # The encoder's count is that of the register and the offset together.
+        old = link.read(joint.servo_id, reg.HOMING_OFFSET)
+        stops = joint.name in bounded
+        middle = (motion.low[i] + motion.high[i]) / 2 if stops else motion.middle[i]
+        turn = reg.COUNTS_PER_REVOLUTION
+        offset = int((round(middle) + old - _CENTRE + turn // 2) % turn - turn // 2)
+        offset = max(offset, reg.HOMING_OFFSET.minimum)
+        half = (motion.high[i] - motion.low[i]) / 2
+        low, high = (round(_CENTRE - half), round(_CENTRE + half)) if stops else (0, turn - 1)
+        # Without the lock the servo keeps the values when its power goes.
+        link.set(joint.servo_id, reg.LOCK, 0)
+        for register, value in ((reg.HOMING_OFFSET, offset), (reg.MIN_POSITION, low), (reg.MAX_POSITION, high)):
+            link.set(joint.servo_id, register, value)
+        link.set(joint.servo_id, reg.LOCK, 1)
+        entries[joint.name] = {
+            "id": joint.servo_id,
+            "drive_mode": int(motion.directions[joint.name] < 0),
+            "homing_offset": offset,
+            "range_min": low,
+            "range_max": high,
+        }
+    path.write_text(json.dumps(entries, indent=2) + "\n", encoding="utf-8")
