@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from sim2real.emulation.body import Body
 from sim2real.emulation.faults import truth_header
@@ -42,6 +44,11 @@ class VirtualLegs(VirtualTime):
     def silent(self) -> bool:
         """Whether the cable is unplugged."""
         return self.legs.has(self._config.silent_after_s, self._now_ns)
+
+    def strike(self, **faults: Any) -> None:
+        """Let faults begin, or end, now; named as the fields of `UnitreeEmulation`."""
+        self._config = self.legs._config = self._sender._config = replace(self._config, **faults)
+        self.legs.faulty_ns = self._now_ns
 
     def stop(self) -> None:
         """End the robot, after which its truth is complete. May be called twice."""

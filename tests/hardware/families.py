@@ -2,7 +2,7 @@
 
 import importlib.util
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -91,11 +91,6 @@ class _Legs(Family):
 
     def on(self, robot: Any) -> list[int]:
         return np.flatnonzero(robot.legs._modes).tolist()
-
-    def strike(self, robot: Any, **faults: Any) -> None:
-        if "silent_after_s" in faults:  # which counts from the robot's start
-            faults["silent_after_s"] += 1e-9 * robot.now_ns()
-        robot._config = robot.legs._config = robot._sender._config = replace(robot._config, **faults)
 
     def is_safe(self, effects: np.ndarray) -> np.ndarray:
         mode, _, kp = effects["values"][:, :3].T
