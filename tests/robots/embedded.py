@@ -7,7 +7,7 @@ import numpy as np
 
 from sim2real.emulation.virtual import VirtualRobot
 from sim2real.hardware.safety.rig import Rig
-from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.load import load_robot
 
 HZ = 50.0
 SHARES = {"arm": (0.5, 0.8, 0.8), "so101": (0.5, 0.8, 0.3, 0.5, 0.5, 0.5)}
@@ -20,11 +20,10 @@ class Arm:
     faulty = 1
 
     def __init__(self, name):
-        pipeline = load_pipeline(name)
-        robot = pipeline.load()
+        robot = load_robot(name)
         self.name, self.drive, self.model = name, robot.drive, robot.model
         self.servos = robot.drive.servos
-        self.limits, self.joints, self.mounting = pipeline.deploy.gate, self.servos.names, self.servos.mounting
+        self.limits, self.joints, self.mounting = robot.defaults.deploy.gate, self.servos.names, self.servos.mounting
         self.id = self.servos.ids[self.faulty]
         self.low = np.maximum(self.servos.low, -self.limits.limit)
         self.high = np.minimum(self.servos.high, self.limits.limit)
@@ -52,13 +51,13 @@ class Arm:
             rig.follow(following)
         return rig
 
-    def raised(self, first):
+    def raised(self, first, swing=0.3):
         """Return a policy on the way to a pose in which the arm weighs on its joints, and around it."""
         goal, pose = first.position_rad, self.low + np.array(SHARES[self.name]) * (self.high - self.low)
 
         def step(k, reading):
             nonlocal goal
-            around = pose + 0.3 * math.sin(6.0 * k / HZ)
+            around = pose + swing * math.sin(6.0 * k / HZ)
             goal = np.clip(goal + np.clip(around - goal, -1.5 / HZ, 1.5 / HZ), self.low, self.high)
             return goal
 
@@ -97,10 +96,9 @@ class Pendulum(Arm):
     faulty = 0
 
     def __init__(self):
-        pipeline = load_pipeline("pendulum")
-        robot = pipeline.load()
+        robot = load_robot("pendulum")
         self.name, self.drive, self.model, self.id = "pendulum", robot.drive, robot.model, 1
-        self.limits, self.joints = pipeline.deploy.gate, ("hinge",)
+        self.limits, self.joints = robot.defaults.deploy.gate, ("hinge",)
         from sim2real.hardware.joint import Joint
 
         self.mounting = (Joint("hinge"),)
@@ -143,10 +141,9 @@ class Go2(Arm):
     faulty = 1
 
     def __init__(self):
-        pipeline = load_pipeline("go2")
-        robot = pipeline.load()
+        robot = load_robot("go2")
         self.name, self.drive, self.id = "go2", robot.drive, self.faulty
-        self.limits, self.joints = replace(pipeline.deploy.gate, first_step_rad=np.inf), robot.drive._joints
+        self.limits, self.joints = replace(robot.defaults.deploy.gate, first_step_rad=np.inf), robot.drive._joints
         self.stance = robot.drive._stance
 
     def robot(self, seed, plant=None, **faults):

@@ -1,0 +1,65 @@
+"""A family of servos is a table: one that nobody has, with its driver, its emulator and all tests of a device."""
+
+from dataclasses import dataclass
+
+from families import PLANTS
+
+from sim2real.emulation.bus import BusEmulation, InstructedBus
+from sim2real.emulation.conformance import DeviceConformance
+from sim2real.emulation.firmware import ServoFirmware
+from sim2real.hardware import feetech
+from sim2real.hardware.bus.port import BusConfig
+from sim2real.hardware.bus.registers import Family, Register, ServoModel, eeprom, ram
+from sim2real.hardware.bus.servos import Drive, Servos
+
+RAD = 6.283185307179586 / 4096
+ID, MODE, DELAY = eeprom("id", 5, 1, 0, 253, 1), eeprom("mode", 6, 1, 0, 1), eeprom("return_delay", 7, 1, 0, 254)
+LOW, HIGH = eeprom("low", 8, 2, 0, 4095, 0), eeprom("high", 10, 2, 0, 4095, 4095)
+TORQUE, GOAL, P = ram("torque", 20, 1, 0, 1), ram("goal", 22, 2, 0, 4095, 0, unit=RAD), ram("p", 24, 2, 0, 9999, 500)
+D, SPEED = ram("d", 26, 2, 0, 9999), ram("speed", 28, 2, 0, 4095, unit=RAD)
+POSITION, LOAD = Register("position", 40, 2, unit=RAD, sign=15), Register("load", 44, 2, unit=0.001, sign=15)
+VELOCITY = Register("velocity", 42, 2, unit=RAD, sign=15)
+MODEL, FIRMWARE = Register("model", 0, 2, default=7), Register("firmware", 2, 1, default=4)
+VOLTS, WARMTH = Register("voltage", 46, 1, default=74), Register("temperature", 47, 1, default=25)
+FAMILY = Family(
+    "Acme", feetech.PROTOCOL, list(globals().values()), 96, (1_000_000,),
+    torque=TORQUE, goal=GOAL, goals=(GOAL,), limits=(LOW, HIGH), mode=MODE, model_number=MODEL, servo_id=ID,
+    return_delay=DELAY, position=POSITION, velocity=VELOCITY, load=LOAD, controller=(P, D, SPEED), firmware=(FIRMWARE,),
+    voltage=VOLTS, temperature=WARMTH, begin={DELAY: 0}, watched=(TORQUE,), full_rad=500.0,
+    models={7: ServoModel("Acme 7", None, "this file")},
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class AcmeDrive(Drive):
+    p_gain: int = 800
+    mode, goal = 0, GOAL
+
+    def registers(self):
+        return {P: self.p_gain}
+
+
+class AcmeServos(Servos):
+    family = FAMILY
+
+
+class AcmeFirmware(ServoFirmware):
+    family = FAMILY
+
+
+class AcmeBus(InstructedBus[AcmeFirmware, "AcmeEmulation"]):
+    family, wild_counts = FAMILY, (8192, 32767)
+
+    def make_servo(self, servo_id):
+        return AcmeFirmware(servo_id, 7, self.config.return_delay_us)
+
+
+class AcmeEmulation(BusEmulation):
+    bus_type = AcmeBus
+
+
+class TestAcme(DeviceConformance):
+    emulation, plant = AcmeEmulation, f"{PLANTS}:Joints"
+
+    def make_device(self, port):
+        return AcmeServos(BusConfig(port, max_silence_s=0.5, silence_s=0.6), (1, 2, 3), AcmeDrive())
