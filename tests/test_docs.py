@@ -80,7 +80,6 @@ TRUE = {
     ],
     "docs/graph.md": [
         "abs(nodes['agent'].phase - 0.003) < 1e-9 and abs(nodes['actuator'].phase - 0.007) < 1e-9",
-        "abs(statistics.age_s['sensor'].p99 - 0.001) < 1e-9",
         "(Actuator.sent[0], Actuator.sent[-1]) == ('torque on', 'torque off') and len(Actuator.sent) > 5",
         "heights[0] < -0.5 and heights.max() > 0.9",  # pushing in the direction of motion swings it up
         "abs(float(estimate.parameters['mass']) / 0.0509 - 1.0) < 0.1 and estimate.loss < 0.1 * estimate.start",

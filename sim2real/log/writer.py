@@ -45,8 +45,8 @@ from sim2real.types import Json, PyTree
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-# A crash costs at most 0.25 s of data; 0.15 s of it is the margin for a writer thread that wakes late: with 0.05 s, two
-# busy cores lost 0.26 s once. A flush each 0.1 s makes the log 8 % larger than one each 0.2 s.
+# A crash may cost at most 0.25 s of data: 0.1 s between two flushes, and 0.15 s for a writer thread that wakes late.
+# Flushing each 0.1 s makes the log 8 % larger than each 0.2 s.
 FLUSH_PERIOD_S = 0.1
 SYNC_PERIOD_S = 1.0
 # `close` waits for the writer in steps of WAIT_S, reports its progress after every so many of them, and gives up if the

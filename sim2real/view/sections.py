@@ -254,7 +254,10 @@ def _episode_blocks(artifact: StageFolder) -> list[Block]:
         "Computation of a step [ms]": ArtifactTable(("node", "", "p50", "p99", "max"), times),
         "Noise of a reading": drawn.noise_table(),
     }
-    return [NoteBlock(caption), *(TableBlock.of(name, table) for name, table in tables.items() if table.rows)]
+    return [
+        ListBlock("The episodes of the training", [caption]),
+        *(TableBlock.of(name, table) for name, table in tables.items() if table.rows),
+    ]
 
 
 def sensitivity_blocks(folder: Path) -> list[Block]:

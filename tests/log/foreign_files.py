@@ -33,7 +33,7 @@ rate_hz = 40.0
 fields.action = { source = "u", unit = "V", shape = [1] }
 [nodes.sensor]
 stamps = "t"
-fields.th = { source = "q", column = 0, unit = "rad" }
+fields.th = { source = "q[:,0]", unit = "rad" }
 """
 
 

@@ -233,7 +233,7 @@ def _signals(table: Table, name: str, node: NodeMapping) -> _Signals:
 
 def _field(table: Table, where: str, how: FieldMapping) -> np.ndarray:
     """Read a field's signal, unscaled; several sources are stacked along the last axis."""
-    parts = [table.signal(source, how.column) for source in how.sources]
+    parts = [table.signal(source) for source in how.sources]
     for source, part in zip(how.sources, parts, strict=True):
         # Jumps by 2^16 or 2^32 are counts that were read with the wrong sign, whatever their unit.
         for column in part.reshape(len(part), -1).T if part.ndim and how.log_unit == "rad" and not how.turn else ():

@@ -43,12 +43,11 @@ class FieldMapping(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
     """The source of a field of a node's output.
 
     Attributes:
-        source: Name of a signal in the file, or several, which are stacked.
+        source: Name of a signal in the file, or several, which are stacked; ``q[:,0]`` is a column of an array.
         unit: Unit of the field after scaling; degrees, turns and counts are converted to radians, mm to m.
         scale: The field is ``scale * signal + offset``; one number, or one for each column.
         offset: See ``scale`` [the field's unit]; one number, or one for each column.
         shape: Shape of one sample; None: as in the file; ``(-1,)``: a vector, of a number one of length 1.
-        column: Column of a two-dimensional signal; None: all columns.
         turn: A turn in the signal's unit, to count turns of angles that jump at its end; 0: no counting.
     """
 
@@ -57,7 +56,6 @@ class FieldMapping(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
     scale: float | tuple[float, ...] = 1.0
     offset: float | tuple[float, ...] = 0.0
     shape: tuple[int, ...] | None = None
-    column: int | None = None
     turn: float = 0.0
 
     def __post_init__(self) -> None:

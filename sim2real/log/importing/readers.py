@@ -119,17 +119,16 @@ class Table:
         else:
             self.columns[name] = column
 
-    def signal(self, source: str, column: int | None = None) -> np.ndarray:
+    def signal(self, source: str) -> np.ndarray:
         """Return a signal.
 
         Args:
             source: Its name; ``[:,0]`` or ``[:,1:3]`` after the name selects columns.
-            column: Column of a two-dimensional signal; None: all columns.
 
         Raises:
             UsageError: When the signal or column does not exist, or holds other values than numbers.
         """
-        name, chosen = source, column
+        name, chosen = source, None
         if source not in self.columns and (match := _COLUMNS.fullmatch(source)):
             name, text = match[1], match[2]
             parts = [int(part) if part.strip() else None for part in text.split(":")]

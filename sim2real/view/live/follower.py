@@ -102,7 +102,7 @@ class Follower:
         return True
 
     def _offset_s(self, epoch_ns: int) -> float:
-        """Return the begin of a log after that of the first one [s]."""
+        """Return by how much a log begins after the first one [s]."""
         if self._first_ns is None:
             self._first_ns = epoch_ns
         return (epoch_ns - self._first_ns) / 1e9
