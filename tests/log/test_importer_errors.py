@@ -114,7 +114,6 @@ def test_mappings_that_make_no_sense(tables, words):
 
 def test_mapping_files_that_are_none(tmp_path):
     for path, words in [
-        (None, ["--pipeline NAME", "--mapping FILE.toml"]),
         (tmp_path / "none.toml", ["no mapping file", "none.toml"]),
         (tmp_path, ["cannot be read"]),
     ]:
