@@ -19,7 +19,7 @@ from sim2real.graph.node import BaseNode, Scheduling
 from sim2real.identification.parameters import Parameter, ParameterTable
 from sim2real.later import jax, jnp
 from sim2real.robots.messages import EpisodeStart
-from sim2real.training.environment.tasks import Rewards
+from sim2real.training.environment.tasks import Rewards, TrainingTask
 from sim2real.types import Array, PyTree, Scalar
 
 if TYPE_CHECKING:
@@ -270,8 +270,8 @@ class IdentifiableLoop:
         return {**params, SENSOR: DelayParams(values[DELAYS[0]] + self.ahead_s)}
 
 
-class LoopTask:
-    """The training task of a robot in a loop; see ``sim2real.training.environment.graph_environment.TrainingTask``.
+class LoopTask(TrainingTask):
+    """The training task of a robot in a loop.
 
     Args:
         draws: Samples of some parameters, each of shape ``(K,)``; one of the K joint samples is drawn for each episode
@@ -282,6 +282,7 @@ class LoopTask:
     """
 
     supervisor = AGENT
+    has_curriculum = True
 
     def __init__(self, robot: Robot, agent: Any, values: Mapping[str, float], draws: Mapping[str, np.ndarray]) -> None:
         self.robot, self.agent = robot, agent
@@ -302,12 +303,7 @@ class LoopTask:
         task.values, task.draws = data
         return task
 
-    def params(self, key: jax.Array) -> dict[str, PyTree]:
-        """Draw the parameters of an episode."""
-        return self.params_at(key, None)
-
-    def params_at(self, key: jax.Array, width: jax.Array | None) -> dict[str, PyTree]:
-        """Draw the parameters of an episode that has a share of all differences; None: all of them."""
+    def params(self, key: jax.Array, width: jax.Array | None = None) -> dict[str, PyTree]:
         draw, task = partial(self._draw, width=width), self.robot.task
         # Draw values and start; then move the start, and scale the noise.
         if any(self.start):

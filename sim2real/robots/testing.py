@@ -25,8 +25,7 @@ from sim2real.identification.model import IdentifiableModel
 from sim2real.robots.loop import ACTUATOR, AGENT, SENSOR, WORLD
 from sim2real.robots.robot import RecordedRobot, Robot, as_columns, as_sent, checked
 from sim2real.runtime.compiled.graph import CompiledGraph
-from sim2real.training.environment.graph_environment import TrainingTask
-from sim2real.training.environment.tasks import EndingTask, PrivilegedTask, terms_of
+from sim2real.training.environment.tasks import TrainingTask, terms_of
 from sim2real.types import PyTree
 
 _EPISODE_S = 0.2
@@ -148,9 +147,8 @@ def _judged(task: TrainingTask, graph_state: GraphState) -> dict[str, PyTree]:
     """Return a task's results for the graph's state."""
     reward = task.reward(graph_state, jnp.asarray(task.action_low))
     results = {f"reward {name!r}": term for name, term in terms_of(reward).items()} or {"reward": reward}
-    results |= {"success": task.success(graph_state)}
-    results |= {"terminated": task.terminated(graph_state)} if isinstance(task, EndingTask) else {}
-    return results | ({"privileged": task.privileged(graph_state)} if isinstance(task, PrivilegedTask) else {})
+    results |= {"success": task.success(graph_state), "terminated": task.terminated(graph_state)}
+    return results if task.privileged is None else results | {"privileged": task.privileged(graph_state)}
 
 
 def _check_judgement(judged: Mapping[str, Any]) -> None:

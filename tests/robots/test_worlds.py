@@ -101,7 +101,7 @@ def test_the_curriculum_reaches_the_task_of_a_robot_in_another_world(table, monk
     """It was dropped: commands came in full size from the first episode on."""
     monkeypatch.setattr(type(table.task), "narrowed", lambda self, start, share: start.replace(aim=share * start.aim))
     _, task = in_world(table, "oiled").training(VALUES, {}, {}, False)
-    whole, half = (task.params_at(jax.random.key(0), jnp.float32(w))["agent"].aim for w in (1.0, 0.5))
+    whole, half = (task.params(jax.random.key(0), jnp.float32(w))["agent"].aim for w in (1.0, 0.5))
     np.testing.assert_allclose(half, 0.5 * whole)
     assert float(jnp.abs(whole).max()) > 0
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from sim2real.training.environment.protocol import Step
+from sim2real.training.environment.protocol import Step, TrainingEnvironment
 
 
 @struct.dataclass
@@ -42,7 +42,7 @@ def _physics(x, u, dt=0.02, substeps=2):
     return x
 
 
-class Pendulum:
+class Pendulum(TrainingEnvironment):
     """Swing-up at 50 Hz for 5 s; a command acts one step late and a measurement arrives one step late."""
 
     observation_size = 19
@@ -81,7 +81,7 @@ class Pendulum:
         return Step(new, self._observe(new), -cost, jnp.bool_(False), end, jnp.bool_(True), metrics)
 
 
-class Bandit:
+class Bandit(TrainingEnvironment):
     """One row, one decision: the reward is highest at the action that the observation asks for."""
 
     observation_size = 2
@@ -102,7 +102,7 @@ class Bandit:
         return Step(state, state["wanted"], -jnp.sum(error**2), yes, ~yes, yes, metrics)
 
 
-class Coin:
+class Coin(TrainingEnvironment):
     """Each row's reward is a coin, tossed at the start, which the policy does not see."""
 
     observation_size = 1
@@ -121,7 +121,7 @@ class Coin:
         return 1e-4 * jnp.stack([3.0 + state["coin"], 7.0])
 
 
-class Constant:
+class Constant(TrainingEnvironment):
     """Reward 1 per policy step, spread over ``rows_per_step`` rows; ends after ``length`` policy steps."""
 
     observation_size = 1
@@ -171,7 +171,7 @@ class Counter(Constant):
         )
 
 
-class Sign:
+class Sign(TrainingEnvironment):
     """A sign is shown at the first of six rows; to be said again in all the others."""
 
     observation_size = 2

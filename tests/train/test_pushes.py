@@ -133,7 +133,7 @@ def test_a_share_of_all_differences_is_that_share_of_each(robot, loop, monkeypat
     monkeypatch.setattr(task, "start", (0.3, 1.0))
     env = GraphEnvironment(graph, task, curriculum=(0.2, 0.8))
     keys = jax.random.split(KEY, 64)
-    start = jax.jit(lambda width: jax.vmap(lambda key: env.reset_at(key, width))(keys)[0].graph.params)
+    start = jax.jit(lambda width: jax.vmap(lambda key: env.reset(key, width))(keys)[0].graph.params)
     none, half, full = (jax.device_get(start(jnp.float32(w))) for w in (0.0, 0.5, 1.0))
     np.testing.assert_allclose(none["world"].K, none["world"].K[0], rtol=1e-6)
     assert np.std(full["world"].K) > 0.1 * full["world"].K.mean()
@@ -154,10 +154,8 @@ class Growing(Bandit):
 
     curriculum = (0.2, 0.7)
 
-    def reset(self, key):
-        return self.reset_at(key, jnp.float32(self.curriculum[1]))
-
-    def reset_at(self, key, width):
+    def reset(self, key, width=None):
+        width = jnp.float32(self.curriculum[1]) if width is None else width
         state, observation = super().reset(key)
         return {**state, "width": width}, observation
 

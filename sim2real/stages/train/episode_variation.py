@@ -15,8 +15,8 @@ from sim2real.robots.loop import DELAYS, LoopTask
 from sim2real.robots.nodes import SimSensor
 from sim2real.stages.terminal.console import note
 from sim2real.stages.train.config import TrainConfig
-from sim2real.training.environment.graph_environment import TrainingTask
 from sim2real.training.environment.pushes import Pushes
+from sim2real.training.environment.tasks import TrainingTask
 from sim2real.training.environment.timelines import TimelineDraw
 from sim2real.training.environment.variation import VariationConfig
 

@@ -19,7 +19,8 @@ from sim2real.robots.robot import Robot
 from sim2real.stages.train.config import TrainConfig
 from sim2real.stages.train.training_setup import prepare
 from sim2real.training.config import PPOConfig
-from sim2real.training.environment.graph_environment import GraphEnvironment, TrainingTask
+from sim2real.training.environment.graph_environment import GraphEnvironment
+from sim2real.training.environment.tasks import TrainingTask
 from sim2real.training.networks.policy import Policy
 from sim2real.training.ppo.rollout import evaluate
 from sim2real.types import Array

@@ -24,7 +24,7 @@ from sim2real.robots.robot import Robot
 from sim2real.stages.train.config import TrainConfig
 from sim2real.stages.train.show import training_summary
 from sim2real.stages.train.training_setup import TrainingSetup
-from sim2real.training.environment.graph_environment import TrainingTask
+from sim2real.training.environment.tasks import TrainingTask
 from sim2real.training.networks.onnx_export import export_graph
 from sim2real.training.networks.policy import Policy
 from sim2real.training.ppo.trainer import TrainResult

@@ -11,7 +11,7 @@ import numpy as np
 from sim2real.composer.physics.mjx.environment import MjxEnvironment
 from sim2real.composer.task import UNLIMITED
 from sim2real.errors import UsageError
-from sim2real.training.environment.protocol import Step
+from sim2real.training.environment.protocol import Step, TrainingEnvironment
 from sim2real.training.environment.tasks import REWARD
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ class TaskState(NamedTuple):
     terms: dict[str, jax.Array]
 
 
-class TaskEnvironment:
+class TaskEnvironment(TrainingEnvironment):
     """A composed task on MJX as an environment; the observation is the vector of all its observables, in their order.
 
     Args:
@@ -51,7 +51,7 @@ class TaskEnvironment:
             )
         self.action_low, self.action_high = bounds
 
-    def reset(self, key: jax.Array) -> tuple[TaskState, jax.Array]:
+    def reset(self, key: jax.Array, width: jax.Array | None = None) -> tuple[TaskState, jax.Array]:
         """Return the state at the start of an episode and the first observation."""
         state = self.environment.reset(key)
         return TaskState(state, state.terms), _vector(state)

@@ -13,56 +13,10 @@ from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, StepState
 from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.runtime.program_arguments import data_of, with_data
-from sim2real.training.environment.protocol import Step
+from sim2real.training.environment.protocol import Step, TrainingEnvironment
 from sim2real.training.environment.pushes import Pushes
-from sim2real.training.environment.tasks import (
-    REWARD,
-    EndingTask,
-    PrivilegedTask,
-    Rewards,
-    WideningTask,
-    checked_end,
-    terms_of,
-    total_of,
-)
+from sim2real.training.environment.tasks import REWARD, Rewards, TrainingTask, checked_end, terms_of, total_of
 from sim2real.types import PyTree
-
-
-class TrainingTask(Protocol):
-    """The training task of a pipeline: observation, action, reward and success.
-
-    ``sim2real.training.environment.tasks`` has protocols of further methods that a task may have.
-
-    Attributes:
-        supervisor: Name of the node whose steps the policy makes.
-        action_low: Shape ``(A,)``: lower bounds of the action [the command's unit].
-        action_high: Shape ``(A,)``: upper bounds of the action [the command's unit].
-    """
-
-    supervisor: str
-    observation_size: int
-    action_low: np.ndarray
-    action_high: np.ndarray
-
-    def params(self, key: jax.Array) -> dict[str, PyTree]:
-        """Draw the parameters of the graph's nodes for one episode."""
-        ...
-
-    def observe(self, step_state: StepState) -> jax.Array:
-        """Return the policy's observation, shape ``(observation_size,)``, from the supervisor's step state."""
-        ...
-
-    def act(self, step_state: StepState, action: jax.Array) -> tuple[StepState, PyTree]:
-        """Return the supervisor's new step state and its output for an action, shape ``(A,)``."""
-        ...
-
-    def reward(self, graph_state: GraphState, action: jax.Array) -> Rewards:
-        """Return the reward of a row, or its terms by name, each of shape ``()``, for an ``action (A,)``."""
-        ...
-
-    def success(self, graph_state: GraphState) -> jax.Array:
-        """Return whether the task is fulfilled in the graph's state after a row, bool of shape ``()``."""
-        ...
 
 
 @runtime_checkable
@@ -92,7 +46,7 @@ class EnvState(NamedTuple):
     width: jax.Array | None = None
 
 
-class GraphEnvironment:
+class GraphEnvironment(TrainingEnvironment):
     """A graph as an environment; each episode has a random one of the graph's timelines, and its own parameters.
 
     An episode is truncated at the end of its timeline, or after the number of policy steps in ``steps``: the value of
@@ -120,13 +74,15 @@ class GraphEnvironment:
     ) -> None:
         self.graph, self.task = graph, task
         self.pushes, self.curriculum, self.follow = pushes, curriculum, follow
-        if curriculum is not None and not isinstance(task, WideningTask):
+        if curriculum is not None and not task.has_curriculum:
             raise UsageError(
-                f"a {type(task).__name__} has no curriculum: it has no `params_at`",
-                hint="give the task a method params_at(key, width), or leave out --vary.curriculum",
+                f"a {type(task).__name__} has no curriculum",
+                hint="set its has_curriculum and let params(key, width) use the width, or leave out --vary.curriculum",
             )
         self.observation_size = task.observation_size
         self.action_low, self.action_high = task.action_low, task.action_high
+        of_task = task.privileged
+        self.privileged = None if of_task is None else lambda state: of_task(state.graph)
 
         # One row less than the tables have, as the observation after an episode's last row is looked up in them too.
         # So no row is past their end, and no state has to be masked.
@@ -153,21 +109,10 @@ class GraphEnvironment:
         env._data = data
         return env
 
-    def privileged(self, state: EnvState) -> jax.Array:
-        """Return the task's privileged entries of a state, shape ``(P,)``."""
-        if not isinstance(self.task, PrivilegedTask):
-            raise UsageError(
-                f"a {type(self.task).__name__} has no privileged entries for a value function",
-                hint="give the task a method privileged(graph_state) -> (P,), or train without --ppo.privileged",
-            )
-        return self.task.privileged(state.graph)
-
-    def reset(self, key: jax.Array) -> tuple[EnvState, jax.Array]:
-        """Start an episode on a random timeline; with a curriculum, as at its end."""
-        return self._start(self.data, key, None if self.curriculum is None else jnp.float32(self.curriculum[1]))
-
-    def reset_at(self, key: jax.Array, width: jax.Array) -> tuple[EnvState, jax.Array]:
-        """Start an episode with a share, shape ``()``, of the differences between episodes."""
+    def reset(self, key: jax.Array, width: jax.Array | None = None) -> tuple[EnvState, jax.Array]:
+        """Start an episode on a random timeline."""
+        if width is None and self.curriculum is not None:
+            width = jnp.float32(self.curriculum[1])
         return self._start(self.data, key, width)
 
     def step(self, state: EnvState, action: jax.Array, key: jax.Array) -> Step:
@@ -180,10 +125,7 @@ class GraphEnvironment:
         # Draw a timeline and the parameters.
         k_eps, k_params, k_init = jax.random.split(key, 3)
         eps = jax.random.randint(k_eps, (), 0, graph.episodes)
-        if width is not None and isinstance(task, WideningTask):
-            params = task.params_at(k_params, width)
-        else:
-            params = task.params(k_params)
+        params = task.params(k_params) if width is None else task.params(k_params, width)
 
         # Run to the supervisor's first step.
         gs = graph.init(k_init, params=params, eps=eps)
@@ -215,8 +157,8 @@ class GraphEnvironment:
 
         # End of the episode: by the task, by a world, or by the timeline.
         of_worlds = [ends(gs.state[name]) for name, ends in self._ending.items()]
-        of_task = [checked_end(task.terminated(gs), task)] if isinstance(task, EndingTask) else []
-        terminated = jnp.any(jnp.array([e[0] for e in of_worlds] + of_task, bool))
+        ended = checked_end(task.terminated(gs), task)
+        terminated = jnp.any(jnp.array([*(e[0] for e in of_worlds), ended], bool))
         truncated = (gs.step >= last) | jnp.any(jnp.array([e[1] for e in of_worlds], bool))
 
         # Pushes, then everything up to the supervisor's next step.

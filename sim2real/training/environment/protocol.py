@@ -14,7 +14,7 @@ the observation returned in that row). If both are set, the row counts as termin
 """
 
 from collections.abc import Callable
-from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -49,40 +49,37 @@ class Step(NamedTuple):
     metrics: dict[str, jax.Array]
 
 
-class TrainingEnvironment(Protocol):
-    """One copy of an environment; ``reset`` and ``step`` are pure and PPO vmaps them."""
+class TrainingEnvironment:
+    """One copy of an environment; ``reset`` and ``step`` are pure and PPO vmaps them.
 
-    @property
-    def observation_size(self) -> int:
-        """Number of entries O of an observation."""
-        ...
+    Attributes:
+        observation_size: Number of entries O of an observation.
+        action_low: Shape ``(A,)``: lower bounds of the action [the action's units].
+        action_high: Shape ``(A,)``: upper bounds of the action [the action's units].
+        curriculum: Share of the differences between episodes at the first and at the last update; None: always all.
+        follow: Success above which the share grows, by the metric ``success``; 0: it grows with the updates.
+        privileged: Returns quantities of a state that the policy does not observe ``(P,)``; None: there are none.
+    """
 
-    @property
-    def action_low(self) -> np.ndarray:
-        """Shape ``(A,)``: lower bounds of the action [the action's units]."""
-        ...
+    observation_size: int
+    action_low: np.ndarray
+    action_high: np.ndarray
+    curriculum: tuple[float, float] | None = None
+    follow: float = 0.0
+    privileged: Callable[[Any], jax.Array] | None = None
 
-    @property
-    def action_high(self) -> np.ndarray:
-        """Shape ``(A,)``: upper bounds of the action [the action's units]."""
-        ...
+    def reset(self, key: jax.Array, width: jax.Array | None = None) -> tuple[Any, jax.Array]:
+        """Return the state at the start of an episode and the first observation, shape ``(O,)``.
 
-    def reset(self, key: jax.Array) -> tuple[PyTree, jax.Array]:
-        """Return the state at the start of an episode and the first observation, shape ``(O,)``."""
-        ...
+        Args:
+            width: Shape ``()``: share of the differences; None: the last of the curriculum. An environment without a
+                curriculum needs no such argument.
+        """
+        raise NotImplementedError
 
-    def step(self, state: PyTree, action: jax.Array, key: jax.Array) -> Step:
+    def step(self, state: Any, action: jax.Array, key: jax.Array) -> Step:
         """Play one row; ``action (A,)`` within the bounds [the action's units]."""
-        ...
-
-
-@runtime_checkable
-class PrivilegedEnvironment(Protocol):
-    """An environment with privileged entries: quantities of the simulation that the policy does not observe."""
-
-    def privileged(self, state: PyTree) -> jax.Array:
-        """Return the world's true state and the episode's parameters, shape ``(P,)``."""
-        ...
+        raise NotImplementedError
 
 
 def get_privileged(env: TrainingEnvironment, config: PPOConfig) -> Callable[[PyTree], jax.Array] | None:
@@ -91,34 +88,12 @@ def get_privileged(env: TrainingEnvironment, config: PPOConfig) -> Callable[[PyT
     Raises:
         UsageError: The environment has no privileged entries.
     """
-    if not config.privileged:
-        return None
-    if not isinstance(env, PrivilegedEnvironment):
+    if config.privileged and env.privileged is None:
         raise UsageError(
-            f"a {type(env).__name__} has no privileged entries for a value function: it has no `privileged`",
-            hint="give it a method privileged(state) -> (P,), or train without --ppo.privileged",
+            f"a {type(env).__name__} has no privileged entries for a value function",
+            hint="give it, or its task, a method privileged(state) -> (P,), or train without --ppo.privileged",
         )
-    return env.privileged
-
-
-@runtime_checkable
-class WideningEnvironment(Protocol):
-    """An environment with a curriculum: the differences between its episodes grow during training."""
-
-    curriculum: tuple[float, float] | None
-    """Share of the differences at the first and at the last update; None: always all."""
-
-    def reset_at(self, key: jax.Array, width: jax.Array) -> tuple[PyTree, jax.Array]:
-        """Do as ``reset``, for an episode with a share ``width ()`` of the differences."""
-        ...
-
-
-@runtime_checkable
-class FollowingEnvironment(WideningEnvironment, Protocol):
-    """An environment whose curriculum may follow success: the metric ``success`` of its episodes."""
-
-    follow: float
-    """Success above which the share grows; 0: it grows with the updates."""
+    return env.privileged if config.privileged else None
 
 
 QUICKEST = 0.25
@@ -133,19 +108,12 @@ def get_width(
     Args:
         reached: The share that success has reached, for training; ``update >= config.updates`` is an evaluation.
     """
-    if not isinstance(env, WideningEnvironment) or env.curriculum is None:
+    if env.curriculum is None:
         return None
     first, last = env.curriculum
     if reached is not None:
         return jnp.where(update >= config.updates, jnp.float32(last), reached)
     return jnp.float32(first) + (last - first) * jnp.clip(update / max(config.updates - 1, 1), 0.0, 1.0)
-
-
-def first_reached(env: TrainingEnvironment) -> float | None:
-    """Return the first share of a curriculum that follows success; None if there is none."""
-    if not isinstance(env, FollowingEnvironment) or env.curriculum is None or env.follow == 0.0:
-        return None
-    return env.curriculum[0]
 
 
 def widen(
@@ -157,22 +125,12 @@ def widen(
         success: Shape ``(T, N)``: the metric of each row.
         ended: Shape ``(T, N)``, bool: the episode ended in the row.
     """
-    if not isinstance(env, FollowingEnvironment) or env.curriculum is None:
+    if env.curriculum is None:
         return reached
     first, last = env.curriculum
     mean = jnp.sum(jnp.where(ended, success, 0.0)) / jnp.maximum(jnp.sum(ended), 1)
     growth = (last - first) / max(QUICKEST * config.updates, 1.0)
     return jnp.where(mean > env.follow, jnp.minimum(reached + growth, last), reached)
-
-
-def get_reset(
-    env: TrainingEnvironment, config: PPOConfig, update: jax.Array, reached: jax.Array | None = None
-) -> Callable[[jax.Array], tuple[PyTree, jax.Array]]:
-    """Return the reset of the episodes that start after ``update ()`` updates; ``reached`` as in ``get_width``."""
-    width = get_width(env, config, update, reached)
-    if width is None or not isinstance(env, WideningEnvironment):
-        return env.reset
-    return lambda key: env.reset_at(key, width)
 
 
 def check_environment(env: TrainingEnvironment) -> None:

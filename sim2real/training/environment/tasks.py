@@ -1,15 +1,18 @@
-"""Optional methods of a training task: termination, privileged entries, a curriculum; and the terms of a reward."""
+"""The training task of a graph, and the terms of its reward. Imports no JAX."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
 from functools import reduce
 from operator import add
-from typing import TYPE_CHECKING, Protocol, TypeAlias, runtime_checkable
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
 
 from sim2real.artifacts.bundle import REWARD as REWARD
 from sim2real.errors import UsageError
-from sim2real.graph.base import GraphState
+from sim2real.graph.base import GraphState, StepState
 from sim2real.later import jax, jnp
 from sim2real.types import PyTree
 
@@ -18,6 +21,49 @@ if TYPE_CHECKING:
     """The reward of a row, shape ``()``, or its terms by name, whose sum it is."""
 else:
     Rewards = PyTree
+
+
+class TrainingTask(ABC):
+    """The training task of a graph: observation, action, reward and success.
+
+    Attributes:
+        supervisor: Name of the node whose steps the policy makes.
+        action_low: Shape ``(A,)``: lower bounds of the action [the command's unit].
+        action_high: Shape ``(A,)``: upper bounds of the action [the command's unit].
+        has_curriculum: Whether ``params`` takes a share of the differences between episodes.
+        privileged: Returns true quantities of a graph's state ``(P,)``, for a value function; None: there are none.
+    """
+
+    supervisor: str
+    observation_size: int
+    action_low: np.ndarray
+    action_high: np.ndarray
+    has_curriculum: bool = False
+    privileged: Callable[[GraphState], jax.Array] | None = None
+
+    @abstractmethod
+    def params(self, key: jax.Array, width: jax.Array | None = None) -> dict[str, PyTree]:
+        """Draw the parameters of the graph's nodes for an episode with a share of the differences; None: all."""
+
+    @abstractmethod
+    def observe(self, step_state: StepState) -> jax.Array:
+        """Return the policy's observation, shape ``(observation_size,)``, from the supervisor's step state."""
+
+    @abstractmethod
+    def act(self, step_state: StepState, action: jax.Array) -> tuple[StepState, PyTree]:
+        """Return the supervisor's new step state and its output for an action, shape ``(A,)``."""
+
+    @abstractmethod
+    def reward(self, graph_state: GraphState, action: jax.Array) -> Rewards:
+        """Return the reward of a row, or its terms by name, each of shape ``()``, for an ``action (A,)``."""
+
+    @abstractmethod
+    def success(self, graph_state: GraphState) -> jax.Array:
+        """Return whether the task is fulfilled in the graph's state after a row, bool of shape ``()``."""
+
+    def terminated(self, graph_state: GraphState) -> jax.Array:
+        """Return whether the episode ended in the graph's state after a row, bool of shape ``()``; default: never."""
+        return jnp.bool_(False)
 
 
 def checked_end(ended: jax.Array, task: object) -> jax.Array:
@@ -44,30 +90,3 @@ def total_of(reward: Rewards) -> jax.Array:
     if not reward:
         raise UsageError("the task's reward has no terms", hint="return a number, or terms by name")
     return reduce(add, reward.values())
-
-
-@runtime_checkable
-class EndingTask(Protocol):
-    """A task that may end an episode before its time, such as a fall."""
-
-    def terminated(self, graph_state: GraphState) -> jax.Array:
-        """Return whether the episode ended in the graph's state after a row, bool of shape ``()``."""
-        ...
-
-
-@runtime_checkable
-class PrivilegedTask(Protocol):
-    """A task with privileged entries: inputs of a value function besides the policy's observation."""
-
-    def privileged(self, graph_state: GraphState) -> jax.Array:
-        """Return true quantities of the graph's state, shape ``(P,)``, in any units."""
-        ...
-
-
-@runtime_checkable
-class WideningTask(Protocol):
-    """A task with a curriculum: its episodes can have a share of their differences."""
-
-    def params_at(self, key: jax.Array, width: jax.Array | None) -> dict[str, PyTree]:
-        """Draw the parameters of the nodes for an episode with a share of the differences; None: all of them."""
-        ...

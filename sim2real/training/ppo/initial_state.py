@@ -11,7 +11,7 @@ import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.training.config import PPOConfig
-from sim2real.training.environment.protocol import TrainingEnvironment, first_reached, get_privileged
+from sim2real.training.environment.protocol import TrainingEnvironment, get_privileged
 from sim2real.training.networks.architectures import Factory, make_network, name_of
 from sim2real.training.networks.normaliser import Normaliser
 from sim2real.training.networks.sequences import ActorCritic
@@ -54,8 +54,9 @@ def make_initial_state(
     carries = (net.initial_carry() for net in (networks.actor, networks.critic))
     copies = Copies(*_blank(shapes, count), *(_repeated(carry, count) for carry in carries))
     keys = keys if len(configs) == 1 else jnp.tile(keys, len(configs))
-    share = first_reached(env)
-    reached = None if share is None else jnp.full(members, share, jnp.float32)
+    # The share of a curriculum that follows success.
+    follows = env.curriculum is not None and env.follow > 0.0
+    reached = jnp.full(members, env.curriculum[0], jnp.float32) if env.curriculum is not None and follows else None
     return TrainState(params, optimiser, normaliser, privileged, copies, jnp.zeros(members, jnp.int32), keys, reached)
 
 

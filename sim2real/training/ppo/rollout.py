@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from sim2real.training.config import PPOConfig
-from sim2real.training.environment.protocol import TrainingEnvironment, get_privileged, get_reset, metric_names, select
+from sim2real.training.environment.protocol import TrainingEnvironment, get_privileged, get_width, metric_names, select
 from sim2real.training.networks.policy import Policy
 from sim2real.types import PyTree
 
@@ -104,8 +104,8 @@ def collect(
     key_reset, key_noise, key_step = jax.random.split(key, 3)
 
     # Draw one initial state per copy for the whole rollout, as a reset may cost more than a row.
-    reset = get_reset(env, config, jnp.where(evaluating, config.updates, update), reached)
-    initial = jax.vmap(reset)(jax.random.split(key_reset, count))
+    width = get_width(env, config, jnp.where(evaluating, config.updates, update), reached)
+    initial = _reset(env, width, key_reset, count)
     fresh = Copies(*initial, repeat(policy.initial_carry(), count), copies.critic_carry)
     copies = select(jnp.broadcast_to(update == 0, (count,)), fresh, copies)
 
@@ -119,6 +119,12 @@ def collect(
     row = partial(_play_row, env, config, policy, fresh, cut)
     numbers = update * rows + jnp.arange(1, rows + 1)
     return jax.lax.scan(row, copies, (noise, jax.random.split(key_step, (rows, count)), numbers))
+
+
+def _reset(env: TrainingEnvironment, width: jax.Array | None, key: jax.Array, count: int) -> tuple[PyTree, jax.Array]:
+    """Start an episode in each of N copies, with a share ``width ()`` of the differences; None: no curriculum."""
+    reset = env.reset if width is None else partial(env.reset, width=width)
+    return jax.vmap(reset)(jax.random.split(key, count))
 
 
 def _play_row(
@@ -207,8 +213,8 @@ def evaluate(env: TrainingEnvironment, config: PPOConfig, policy: Policy, key: j
         ``finished``: the share of the episodes that ended within ``eval_steps`` rows, and ``terminated``: the share of
         those that a termination ended. Each of shape ``()``.
     """
-    reset = get_reset(env, config, jnp.int32(0))
-    shapes = jax.eval_shape(lambda: jax.vmap(reset)(jax.random.split(jax.random.key(0), config.num_envs)))
+    width = get_width(env, config, jnp.int32(0))
+    shapes = jax.eval_shape(lambda: _reset(env, width, jax.random.key(0), config.num_envs))
     blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), Copies(*shapes))
     blank = blank._replace(carry=repeat(policy.initial_carry(), config.num_envs))
 
