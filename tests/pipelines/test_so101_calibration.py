@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+import so101_person
 
 from sim2real.commands.new import calibrate
 from sim2real.emulation.feetech import StsEmulation
@@ -14,7 +15,7 @@ from sim2real.hardware.device import OperatingMode
 from sim2real.stages.load import load_module, load_robot
 
 SO101 = load_robot("so101")
-GUIDE, PERSON = load_module(SO101.name, "guide"), load_module(SO101.name, "person")
+GUIDE = load_module("so101", "guide")
 PLANT = f"{Path(__file__).with_name('wrong_arms.py')}:WrongArm"
 GOOD = json.loads((SO101.folder / "calibration.json").read_text())
 
@@ -26,7 +27,7 @@ def arm(tmp_path, monkeypatch):
 
     def start(changes=None, emulation=None, **plant):
         hand, file = tmp_path / "hand.npz", tmp_path / "lerobot.json"
-        PERSON.write_motion(hand, begin_s=6.0, speed_rad_s=4.0)
+        so101_person.write_motion(hand, begin_s=6.0, speed_rad_s=4.0)
         file.write_text(json.dumps({name: entry | (changes or {}).get(name, {}) for name, entry in GOOD.items()}))
         monkeypatch.setenv("SO101_CALIBRATION", str(file))
         settings = {"homing_offset": 85, "plant_step_s": 0.001} | (emulation or {})

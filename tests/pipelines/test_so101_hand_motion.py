@@ -4,7 +4,8 @@ import json
 
 import numpy as np
 import pytest
-from test_so101_calibration import FAULTS, GOOD, GUIDE, PERSON, WHOLE_MOTION
+import so101_person
+from test_so101_calibration import FAULTS, GOOD, GUIDE, WHOLE_MOTION
 from wrong_arms import RAD_PER_COUNT, ZERO_COUNTS, WrongArm
 
 from sim2real.errors import HardwareLost
@@ -16,7 +17,7 @@ PERIOD_S, PATIENCE_S, OFFSET = 0.02, 8.0, 85
 
 def moved(folder, joints, calibrated, offset=OFFSET, **faults):
     """Show the whole motion of a person to a motion by hand; return it, and whether it is complete."""
-    end_s = PERSON.write_motion(folder / "hand.npz")
+    end_s = so101_person.write_motion(folder / "hand.npz")
     arm, motion = WrongArm(folder / "hand.npz", **faults), HandMotion(joints, GUIDE.NUDGES, calibrated)
     for t_s in np.arange(0.0, end_s + PATIENCE_S, PERIOD_S):
         arm.advance(t_s)

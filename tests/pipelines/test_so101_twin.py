@@ -4,6 +4,7 @@ import io
 import json
 
 import pytest
+import so101_person
 
 from sim2real import cli
 from sim2real.emulation.truth import Kind
@@ -19,7 +20,7 @@ QUESTION = "press Enter"
 def arm(tmp_path, monkeypatch, virtual_robots):
     """An arm whose person begins 60 s after its start."""
     hand = tmp_path / "hand.npz"
-    load_module(SO101.name, "person").write_motion(hand, begin_s=60.0)
+    so101_person.write_motion(hand, begin_s=60.0)
     embedded = load_module(SO101.name, "robot").embedded()
     monkeypatch.setenv("SO101_CALIBRATION", str(SO101.folder / "calibration.json"))
     monkeypatch.chdir(tmp_path)

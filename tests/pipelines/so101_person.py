@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from .guide import NUDGES
-from .robot import JOINTS
+from sim2real.stages.load import load_module
 
+NUDGES, JOINTS = load_module("so101", "guide").NUDGES, load_module("so101", "robot").JOINTS
 STOPS_RAD = (1.92, 1.745, 1.69, 1.658, 2.7, 0.96)
 """Half of the travel of the embedded arm's joints [rad]."""
 _START, _NUDGE_RAD, _PUSH_RAD = (0.0, -1.74, 1.68, -1.4, 0.0, -0.8), 0.45, 0.15
