@@ -82,6 +82,8 @@ def test_a_composed_task_ends_the_episode_of_its_graph(ends):
         observe=lambda step_state: jnp.zeros(1),
         reward=lambda gs, action: jnp.float32(0),
         success=lambda gs: jnp.bool_(False),
+        terminated=lambda gs: jnp.bool_(False),
+        privileged=None,
     )
     env = GraphEnvironment(graph, task, np.array([9]))
     before = SimpleNamespace(step_state=heard, graph=state, total=0.0, good=0.0, width=None)
