@@ -47,25 +47,9 @@ _WEAK_WORDS = {"state", "states"}
 _SIDE = {word: side for side, listed in _SIDES.items() for word in listed.split()}
 _QUANTITY = {word: quantity for quantity, listed in _QUANTITIES.items() for word in listed.split()}
 _UNIT = {word: unit for unit, listed in _UNITS.items() for word in listed.split()}
-# Words without meaning: parts of messages, and names of lists of records.
-_FILLERS = set(
-    [
-        "data",
-        "entries",
-        "msg",
-        "log",
-        "values",
-        "value",
-        "points",
-        "motor",
-        "motors",
-        "per",
-        "joint",
-        "joints",
-        "header",
-        "field",
-    ]
-)
+_MEANINGLESS = "data entries msg log values value points motor motors per joint joints header field"
+_FILLERS = set(_MEANINGLESS.split())
+"""Parts of messages, and names of lists of records."""
 _WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
 
 
