@@ -27,8 +27,7 @@ from benches import jobs
 from benches.recorded import rigs
 from benches.recorded.sets import Recording
 from benches.rows import Report, Row, four_digits, markdown, row, share
-from sim2real.identification.delay_likelihood import DelayEvidence
-from sim2real.identification.delays import find, lost_share
+from sim2real.identification.delays import DelayEvidence, find, lost_share
 
 KINDS = {
     "fixed": "8 ms",
@@ -181,7 +180,7 @@ def ours(log: Log, seed: int) -> Estimate:
         errors = at(log.t[:, None] - grid, simulated) - log.position[:, None]
         slopes = [at(stamps, angles(x + s) - simulated) / _DIFFERENCE for s in _DIFFERENCE * np.eye(len(x))]
         J = np.stack(slopes, axis=1)[:, None] / NOISE_RAD
-        return DelayEvidence(log.t - log.t.mean(), grid, errors[:, None] / NOISE_RAD, J, 1e-2 * np.eye(len(x)))
+        return DelayEvidence(grid, errors[:, None] / NOISE_RAD, J, 1e-2 * np.eye(len(x)))
 
     again = np.concatenate([[False], np.diff(log.position) == 0.0])
     estimate = find(linearise, first.x[:-1], float(first.x[-1]), again)

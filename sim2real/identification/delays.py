@@ -1,18 +1,21 @@
 """The distribution of the measurements' delay, which no stamp records: mean, 95th percentile, deviation, losses.
 
-The delay of each measurement is hidden, and with it the time of the measured motion. ``hidden`` sums over it: the
-shares of all delays are unknowns beside the dynamics, the initial states and the noise. The commands' delay moves the
-motion as a whole. Its mean adds to that of the measurements, and a log determines only the sum.
+A measurement with stamp t shows the motion at t - d. The model predicts the motion; where it is fast, a measurement
+determines d well. The likelihood of a measurement is a sum over a grid of delays: the share of each delay times the
+density of the measurement at that delay. The dynamics, the initial states, the noise and the shares maximise the
+product over all measurements. The commands' delay moves the motion as a whole: its mean adds to that of the
+measurements, and a log determines only the sum.
 """
 
-from dataclasses import dataclass
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.interpolate import BSpline
 
 from sim2real.artifacts.identification import Link, Ranged
 from sim2real.errors import UsageError
-from sim2real.identification.delay_likelihood import DelayEvidence, Likelihood
-from sim2real.identification.hidden_delays import Hidden, Linearise, hidden
 from sim2real.identification.parameters import ParameterTable
 from sim2real.identification.problem import Problem
 
@@ -22,31 +25,321 @@ _LOST = 0.5
 """Probability of a loss from which on a repeated value counts as lost; below, its delay counts as the others do."""
 _WIDTH = 1.96
 """Half the width of an interval, in standard errors."""
+_BUMPS = 20
+"""Number of splines that form the logarithm of the shares: more of them allow sharper edges."""
+_RIDGE, _SMOOTH = 1e-3, 0.5
+"""Precisions of the splines' weights and of their third differences. Without the first, the share of a delay that never
+occurs is -inf; without the second, shares of neighbouring delays differ by chance."""
+_FLOOR = 1e-12
+"""Least share of a grid point in the likelihood, so that a single measurement cannot make it infinite."""
+_FIRST_S = 0.005
+"""Assumed deviation of delays before the first estimate [s]."""
+_PARTS = 1.0, 0.25, 0.0625
+"""Parts of a step of least squares that are tried."""
+_APART, _TRIES = 2.0, 5
+"""Distance of the mean delays at which a maximum of the likelihood is looked for, in standard errors of the first
+estimate, and the most of them on a side."""
+_ROUNDS = 3
+"""Linearisations of least squares, and of the likelihood."""
+_STEPS = 40
+"""Most steps of a maximisation."""
+_LEAST, _MOST = 40, 100
+"""Points of the grid of shares."""
+
+
+@dataclass(frozen=True)
+class DelayEvidence:
+    """Agreement of measurements with a model's predictions, for every possible delay.
+
+    Attributes:
+        delays: Shape ``(G,)``: delays at equal distances [s].
+        errors: Shape ``(N, F, G)``: prediction minus measurement at each delay, in deviations of the measurement; in
+            the order of time.
+        jacobian: Shape ``(N, F, P)``: d error / d unknown, near the mean delay.
+        prior: Shape ``(P, P)``: precision of the unknowns before the log.
+    """
+
+    delays: np.ndarray
+    errors: np.ndarray
+    jacobian: np.ndarray
+    prior: np.ndarray
+
+    def rows(self, which: np.ndarray) -> "DelayEvidence":
+        """Return some of the measurements, ``(N,)`` bool."""
+        return replace(self, errors=self.errors[which], jacobian=self.jacobian[which])
+
+    def at(self, delays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return errors at other delays ``(K,)`` [s], and their slope by the delay [1/s]; both ``(N, F, K)``."""
+        step = self.delays[1] - self.delays[0]
+        place = (delays - self.delays[0]) / step
+        left = np.clip(np.floor(place).astype(int), 0, len(self.delays) - 2)
+        rise = self.errors[:, :, left + 1] - self.errors[:, :, left]
+        return self.errors[:, :, left] + rise * (place - left), rise / step
+
+
+Linearise = Callable[[np.ndarray, float], DelayEvidence]
+"""From the unknowns ``(P,)`` and a delay [s] to the linearised measurements."""
+
+
+class Likelihood:
+    """The likelihood of all measurements over a grid of delays; a point is offsets of unknowns, log noise, weights.
+
+    Args:
+        grid: Shape ``(K,)``: possible delays of messages, at equal distances [s].
+    """
+
+    def __init__(self, evidence: DelayEvidence, grid: np.ndarray) -> None:
+        self.evidence, self.grid = evidence, grid
+        self.fields, self.unknowns = evidence.jacobian.shape[1:]
+        knots = np.concatenate([np.zeros(3), np.linspace(0.0, 1.0, _BUMPS - 1), np.ones(3)])
+        place = np.clip((grid - grid[0]) / (grid[-1] - grid[0]), 0.0, 1.0 - 1e-12)
+        self.bumps = BSpline.design_matrix(place, knots, 3).toarray()
+        self.size = self.unknowns + self.fields + self.bumps.shape[1]
+        bend = np.diff(np.eye(self.bumps.shape[1]), 3, axis=0)
+        self.prior = np.zeros((self.size, self.size))
+        self.prior[: self.unknowns, : self.unknowns] = evidence.prior
+        self.prior[-bend.shape[1] :, -bend.shape[1] :] = _SMOOTH * bend.T @ bend + _RIDGE * np.eye(bend.shape[1])
+        self._errors, slopes = evidence.at(grid)
+        # A delay may lie between points of the grid: that adds noise of this variance.
+        self._blur = slopes.mean(axis=2) ** 2 * (grid[1] - grid[0]) ** 2 / 12.0
+
+    def start(self, noise: np.ndarray, share: np.ndarray) -> np.ndarray:
+        """Return a start, ``(size,)``, from the noise ``(F,)`` and the shares ``(K,)``."""
+        weights = np.linalg.lstsq(self.bumps, np.log(np.maximum(share, 1e-9)), rcond=None)[0]
+        return np.concatenate([np.zeros(self.unknowns), np.log(noise), weights])
+
+    def noise(self, p: np.ndarray) -> np.ndarray:
+        """Return the deviation of the noise, ``(F,)``."""
+        return np.exp(p[self.unknowns : self.unknowns + self.fields])
+
+    def shares(self, p: np.ndarray) -> np.ndarray:
+        """Return the share of every delay, ``(K,)``."""
+        height = self.bumps @ p[-self.bumps.shape[1] :]
+        share = np.exp(height - height.max())
+        return share / share.sum()
+
+    def __call__(self, p: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        """Return the logarithm of the likelihood and prior, its gradients ``(N, size)`` by row, and its rows ``(N,)``.
+
+        The gradients are those of the likelihood alone.
+        """
+        # The log likelihood of each measurement at each delay.
+        unknowns, variance, share = self.unknowns, self.noise(p)[None] ** 2, self.shares(p)
+        total = variance + self._blur
+        move = (self.evidence.jacobian @ p[:unknowns])[:, :, None]
+        off = (self._errors + move) / np.sqrt(total)[:, :, None]
+        height = -0.5 * (off**2).sum(axis=1) - 0.5 * np.log(total).sum(axis=1)[:, None] + np.log(share + _FLOOR)
+        # The sum over delays, and the probability of each delay.
+        top = height.max(axis=1, keepdims=True)
+        likely = np.exp(height - top)
+        whole = likely.sum(axis=1, keepdims=True)
+        likely /= whole
+        rows = (np.log(whole) + top)[:, 0]
+        # The gradient by unknowns, noise and splines.
+        expected = np.einsum("nk,nfk->nf", likely, off) / np.sqrt(total)
+        squares = np.einsum("nk,nfk->nf", likely, off**2)
+        of_unknowns = -np.einsum("nf,nfp->np", expected, self.evidence.jacobian)
+        gradient = np.hstack([of_unknowns, (squares - 1) * variance / total, (likely - share) @ self.bumps])
+        return float(rows.sum() - 0.5 * p @ self.prior @ p), gradient, rows
+
+    def maximise(self, p: np.ndarray) -> np.ndarray:
+        """Return the maximum near a start, by damped steps with the information matrix of the rows' gradients.
+
+        Solvers of scipy do not use these gradients.
+        """
+        value, gradient, _ = self(p)
+        damping = 1e-3
+        for _ in range(_STEPS):
+            information = gradient.T @ gradient + self.prior
+            uphill = gradient.sum(axis=0) - self.prior @ p
+            scale = np.diag(np.diag(information) + 1e-12)
+            while True:
+                moved = p + np.linalg.solve(information + damping * scale, uphill)
+                new, new_gradient, _ = self(moved)
+                if new >= value:
+                    break
+                damping *= 5
+                if damping > 1e6:
+                    return p
+            damping = max(damping / 5, 1e-6)
+            gain, p, value, gradient = new - value, moved, new, new_gradient
+            if gain < 1e-4:
+                break
+        return p
+
+    def covariance(self, p: np.ndarray) -> np.ndarray:
+        """Return the covariance of the estimate at the maximum, ``(size, size)``."""
+        gradient = self(p)[1]
+        inverse = np.linalg.inv(gradient.T @ gradient + self.prior)
+        spread = inverse @ (_along(gradient) + self.prior) @ inverse
+        return spread * len(gradient) / max(len(gradient) - self.unknowns / self.fields, 1.0)
+
+
+def _along(gradient: np.ndarray) -> np.ndarray:
+    """Return the covariance of the sum of rows ``(N, size)`` that follow each other in time, ``(size, size)``.
+
+    Delays of successive messages depend on each other: a timer's rise and fall periodically, a busy bus's stay long.
+    So products of gradients of messages up to a few steps apart are added (Newey and West, Econometrica 55, 1987).
+    """
+    lags = round(len(gradient) ** (1 / 3))
+    between = gradient.T @ gradient
+    for lag in range(1, lags + 1):
+        product = gradient[lag:].T @ gradient[:-lag]
+        between += (1 - lag / (lags + 1)) * (product + product.T)
+    return between
+
+
+def _straight(
+    evidence: DelayEvidence, delay_s: float, deviation_s: float, noise: np.ndarray, move_delay: bool = True
+) -> tuple[np.ndarray, float, float]:
+    """Return corrections ``(P + 1,)`` of unknowns and mean delay by least squares, the delay's error, and the squares.
+
+    Args:
+        noise: Shape ``(F,)``: deviation of the noise, in deviations of the measurement.
+        move_delay: False: the delay stays.
+    """
+    errors, slopes = evidence.at(np.array([delay_s]))
+    weight = 1.0 / np.sqrt(noise**2 + (slopes[:, :, 0] * deviation_s) ** 2)
+    columns, rest = np.concatenate([evidence.jacobian, slopes], axis=2) * weight[:, :, None], errors[:, :, 0] * weight
+    prior = 1e-12 * np.eye(columns.shape[2])
+    prior[:-1, :-1] += evidence.prior
+    columns[:, :, -1] *= move_delay
+    inverse = np.linalg.inv(np.einsum("nfp,nfq->pq", columns, columns) + prior)
+    move = -inverse @ np.einsum("nfp,nf->p", columns, rest)
+    gradient = np.einsum("nfp,nf->np", columns, rest + columns @ move)
+    return move, float(np.sqrt((inverse @ _along(gradient) @ inverse)[-1, -1])), float((rest**2).sum())
 
 
 @dataclass(frozen=True)
 class Delays:
-    """Delays and losses of one stream of measurements.
+    """The delays of one stream of measurements.
 
     Attributes:
-        hidden: The delays of messages that arrived, and the unknowns of the model.
+        x: Shape ``(P,)``: the unknowns of the model.
+        delays: Shape ``(K,)``: a grid of delays [s].
+        share: Shape ``(K,)``: share of the measurements that have each delay.
+        mean_error: Standard error of the mean by least squares, which assume no shape of the distribution [s].
+        by_shape: Shape ``(K, M)``: d share / d weight of the splines.
+        covariance: Shape ``(M, M)``: of the weights.
+        place: Shape ``(F + M,)``: logarithms of the noise, and the weights of the splines.
         lost: Shape ``(N,)``: the probability that each message was lost.
     """
 
-    hidden: Hidden
+    x: np.ndarray
+    delays: np.ndarray
+    share: np.ndarray
+    mean_error: float
+    by_shape: np.ndarray
+    covariance: np.ndarray
+    place: np.ndarray
     lost: np.ndarray
+
+    @property
+    def mean_s(self) -> float:
+        """The mean delay [s]."""
+        return float(self.share @ self.delays)
 
     def ranged(self, held_s: float = 0.0) -> tuple[Ranged, Ranged, Ranged]:
         """Return mean, deviation and 95th percentile with their intervals [s].
 
+        The mean's error is at least that of least squares: the likelihood's own is too small where the distribution
+        has edges that the splines cannot follow. The percentile's ends are the quantiles at 0.95 minus and plus the
+        error of the distribution there, as a quantile in a gap of the distribution has no standard error; two things
+        widen it: the part of the mean's error that the likelihood lacks, and half a step of the grid.
+
         Args:
             held_s: The sum of other delays, which is part of the mean and of the percentile [s].
         """
-        (mean, mean_error), (deviation, error) = self.hidden.mean, self.hidden.deviation
-        p95, low, high = self.hidden.quantile(0.95, _WIDTH)
-        rows = (mean + held_s, _WIDTH * mean_error), (deviation, _WIDTH * error)
-        first, second = (Ranged(value, max(value - half, 0.0), value + half) for value, half in rows)
-        return first, second, Ranged(p95 + held_s, max(low + held_s, 0.0), high + held_s)
+        likely = self._error(self.delays @ self.by_shape)
+        error = max(likely, self.mean_error)
+        off = (self.delays - self.mean_s) ** 2
+        deviation = float(np.sqrt(self.share @ off))
+        of_deviation = self._error(off @ self.by_shape / (2 * max(deviation, 1e-9)))
+        below = np.cumsum(self.share) - 0.5 * self.share
+        slopes = np.cumsum(self.by_shape, axis=0) - 0.5 * self.by_shape
+        there = self._error(np.array([np.interp(0.95, below, column) for column in slopes.T]))
+        p95, *ends = np.interp([0.95, 0.95 - _WIDTH * there, 0.95 + _WIDTH * there], below, self.delays)
+        lacks = _WIDTH * np.sqrt(error**2 - likely**2)
+        low, high = np.hypot(np.abs(np.array(ends) - p95), lacks) + 0.5 * (self.delays[1] - self.delays[0])
+        rows = (
+            (self.mean_s + held_s, _WIDTH * error, _WIDTH * error),
+            (deviation, _WIDTH * of_deviation, _WIDTH * of_deviation),
+            (float(p95) + held_s, float(low), float(high)),
+        )
+        first, second, third = (Ranged(v, max(v - low, 0.0), v + high) for v, low, high in rows)
+        return first, second, third
+
+    def _error(self, slope: np.ndarray) -> float:
+        return float(np.sqrt(max(slope @ self.covariance @ slope, 0.0)))
+
+
+def _arrived(linearise: Linearise, x: np.ndarray, delay_s: float) -> Delays:
+    """Estimate delays, noise and the unknowns of a model together, from messages none of which was lost.
+
+    Args:
+        linearise: The model; called in every round with the unknowns and the mean delay.
+        x: Shape ``(P,)``: a first estimate of the unknowns.
+        delay_s: A first estimate of the mean delay [s].
+    """
+    # First estimates by least squares; a step that does not lower the errors is taken in part.
+    evidence = linearise(x, delay_s)
+    ones = np.ones(evidence.errors.shape[1])
+    for _ in range(_ROUNDS):
+        move, _, least = _straight(evidence, delay_s, _FIRST_S, ones)
+        for part in _PARTS:
+            there = x + part * move[:-1]
+            later_s = float(np.clip(delay_s + part * move[-1], evidence.delays[0], evidence.delays[-1]))
+            new = linearise(there, later_s)
+            if _straight(new, later_s, _FIRST_S, ones)[2] < least:
+                evidence, x, delay_s = new, there, later_s
+                break
+        else:
+            break
+    # The likelihood has several maxima: begin at delays on both sides, too, and go further while it gets larger.
+    error_s = _straight(evidence, delay_s, _FIRST_S, ones)[1]
+    local = functools.cache(lambda k: _maximum(evidence, delay_s + _APART * error_s * k))
+    best, step = 0, 1 if local(1)[0] > local(-1)[0] else -1
+    while abs(best) < _TRIES and local(best + step)[0] > local(best)[0]:
+        best += step
+    # Maximise it again with the model linearised at the maximum, on a grid around the delays there are.
+    _, likelihood, p = local(best)
+    for _ in range(_ROUNDS):
+        x, noise, share, grid = x + p[: len(x)], likelihood.noise(p), likelihood.shares(p), likelihood.grid
+        evidence = linearise(x, float(share @ grid))
+        grid, share = _support(evidence, grid, share, noise)
+        likelihood = Likelihood(evidence, grid)
+        p = likelihood.maximise(likelihood.start(noise, share))
+    x, noise, share = x + p[: len(x)], likelihood.noise(p), likelihood.shares(p)
+    mean_s = float(share @ grid)
+    # Errors of the estimate.
+    deviation_s = float(np.sqrt(share @ (grid - mean_s) ** 2))
+    mean_error = _straight(evidence, mean_s, deviation_s, noise)[1]
+    by_shape = share[:, None] * (likelihood.bumps - share @ likelihood.bumps)
+    covariance = likelihood.covariance(p)[-by_shape.shape[1] :, -by_shape.shape[1] :]
+    return Delays(x, grid, share, mean_error, by_shape, covariance, p[len(x) :], np.zeros(len(evidence.errors)))
+
+
+def _maximum(evidence: DelayEvidence, delay_s: float) -> tuple[float, Likelihood, np.ndarray]:
+    """Return the largest likelihood near a mean delay [s], the likelihood, and its point."""
+    grid, ones = np.linspace(evidence.delays[0], evidence.delays[-1], _MOST), np.ones(evidence.errors.shape[1])
+    likelihood = Likelihood(evidence, grid)
+    p = likelihood.start(ones, np.exp(-0.5 * ((grid - delay_s) / _FIRST_S) ** 2))
+    p[: likelihood.unknowns] = _straight(evidence, delay_s, _FIRST_S, ones, move_delay=False)[0][:-1]
+    p = likelihood.maximise(p)
+    return likelihood(p)[0], likelihood, p
+
+
+def _support(
+    evidence: DelayEvidence, grid: np.ndarray, share: np.ndarray, noise: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return a grid that covers the delays of all messages, finer than the resolution of a measurement, and shares."""
+    below, few = np.cumsum(share) / share.sum(), 0.3 / len(evidence.errors)
+    step = evidence.delays[1] - evidence.delays[0]
+    low, high = np.interp([few, 1 - few], below, grid) + np.array([-step, step])
+    slopes = np.abs(np.diff(evidence.errors, axis=2)).mean(axis=2) / step / noise
+    fine = 0.7 / max(float(np.quantile(np.sqrt((slopes**2).sum(axis=1)), 0.95)), 1e-9)
+    finer = np.linspace(low, high, int(np.clip((high - low) / fine, _LEAST, _MOST)))
+    return finer, np.interp(finer, grid, share / share.max())
 
 
 def links(problem: Problem, x: np.ndarray) -> tuple[Link, ...]:
@@ -68,9 +361,9 @@ def links(problem: Problem, x: np.ndarray) -> tuple[Link, ...]:
     watched = _Watched(problem, table.encode(values), late, float(values[late]))
     estimate = find(watched.linearise, watched.x, watched.delay_s, watched.again)
     held_s = sum(float(values[n]) for n in commands)
-    grid = estimate.hidden.delays + held_s
+    grid = estimate.delays + held_s
     numbers = estimate.ranged(held_s)
-    return (Link(late, (late, *commands), *numbers, lost_share(estimate.lost), grid, estimate.hidden.share),)
+    return (Link(late, (late, *commands), *numbers, lost_share(estimate.lost), grid, estimate.share),)
 
 
 def measured(table: ParameterTable) -> str:
@@ -96,21 +389,21 @@ def find(linearise: Linearise, x: np.ndarray, delay_s: float, again: np.ndarray)
     first = np.maximum.accumulate(np.where(again, 0, np.arange(len(again))))
 
     def estimated(came: np.ndarray, x: np.ndarray, delay_s: float) -> tuple[float, Delays]:
-        estimate = hidden(lambda x, about_s: linearise(x, about_s).rows(came), x, delay_s)
-        evidence = linearise(estimate.x, estimate.mean[0])
-        density = Likelihood(evidence, estimate.delays, estimate.drift)(estimate.place)[2]
+        estimate = _arrived(lambda x, about_s: linearise(x, about_s).rows(came), x, delay_s)
+        likelihood = Likelihood(linearise(estimate.x, estimate.mean_s), estimate.delays)
+        density = likelihood(np.concatenate([np.zeros(len(x)), estimate.place]))[2]
         # How probable a repetition is if the message came: the density of its age over that of the new value's.
         chance = np.exp(np.minimum(density - density[first], 0.0))
         lost = _losses(again, chance)
         share = np.clip(lost.mean(), 0.5 / len(again), 0.5)
         height = np.where(again, np.log(share + (1.0 - share) * chance), np.log(1.0 - share) + density)
-        return float(height.sum()), Delays(estimate, lost)
+        return float(height.sum()), replace(estimate, lost=lost)
 
     # Estimate from new values; then, too, from repeated ones that came, which have longer delays.
     best = estimated(~again, x, delay_s)
     came = ~again | (best[1].lost < _LOST)
     if (came != ~again).any():
-        best = estimated(came, best[1].hidden.x, best[1].hidden.mean[0])
+        best = estimated(came, best[1].x, best[1].mean_s)
     # The repetitions of a slow device are older than any new value: compare with an estimate in which all came.
     if not came.all():
         best = max(best, estimated(np.ones_like(again), x, delay_s), key=lambda one: one[0])
@@ -162,12 +455,6 @@ class _Watched:
             same[:, 1:] &= rows[:, 1:] == rows[:, :-1]
         self.again = same[self._counts]
         self.x = np.concatenate([x[self._moved], np.zeros(self._states * len(self._segments))])
-        # Stamps are 0 in the middle of each recording.
-        recording = problem.recording[self._segments]
-        stamps = problem.ts[self._segments] + problem.begins_s[self._segments][:, None]
-        for r in np.unique(recording):
-            stamps[recording == r] -= stamps[recording == r][self._counts[recording == r]].mean()
-        self._stamps = stamps[self._counts]
 
     def linearise(self, unknowns: np.ndarray, about_s: float) -> DelayEvidence:
         """Return the evidence at unknowns ``(P,)``, in the motion with a delay of the measurements [s]."""
@@ -195,7 +482,7 @@ class _Watched:
             for e in range(count):
                 J[e, ..., size + self._states * e + k] = slope[e]
         prior = np.diag(np.concatenate([12.0 / table.span[self._moved] ** 2, np.ones(self._states * count)]))
-        return DelayEvidence(self._stamps, delays, errors[self._counts], J[self._counts], prior)
+        return DelayEvidence(delays, errors[self._counts], J[self._counts], prior)
 
     def _errors(self, x: np.ndarray, shift: np.ndarray, delay_s: float, about_s: float) -> np.ndarray:
         """Return the residuals of the segments with a delay of the measurements, in the motion with ``about_s``."""

@@ -8,8 +8,7 @@ from scipy.signal import lfilter
 
 from sim2real.artifacts.identification import Identification, Judgement, Link, Ranged
 from sim2real.errors import UsageError
-from sim2real.identification.delay_likelihood import DelayEvidence
-from sim2real.identification.delays import _losses, find, links, lost_share, measured
+from sim2real.identification.delays import DelayEvidence, _losses, find, links, lost_share, measured
 from sim2real.stages.identify.show import show
 
 GAIN, RATE = 5.0, 8.0  # speed [rad/s] of a volt in the end, and how fast it gets there [1/s]
@@ -78,7 +77,7 @@ def identify(log):
         errors = np.interp(log.stamps[:, None] - GRID, log.at, own) - log.seen[:, None]
         slopes = [np.interp(log.stamps - delay_s, log.at, angles(x + s) - own) / 1e-3 for s in 1e-3 * np.eye(4)]
         J = np.stack(slopes, axis=1)[:, None] / NOISE_RAD
-        return DelayEvidence(log.stamps - log.stamps.mean(), GRID, errors[:, None] / NOISE_RAD, J, 1e-4 * np.eye(4))
+        return DelayEvidence(GRID, errors[:, None] / NOISE_RAD, J, 1e-4 * np.eye(4))
 
     found = find(linearise, start, 0.01, again)
     ranged = found.ranged()
@@ -98,7 +97,7 @@ def test_a_link_is_found_with_the_dynamics(kind):
     assert deviation == pytest.approx(arrived.std(), abs=0.6e-3)
     assert p95 == pytest.approx(np.quantile(arrived, 0.95), abs=1.5e-3)
     assert lost_share(found.lost).value == pytest.approx(record.lost.mean(), rel=0.2, abs=2e-3)
-    assert found.hidden.share.sum() == pytest.approx(1.0)
+    assert found.share.sum() == pytest.approx(1.0)
     assert np.all(low < [mean, deviation, p95])
     assert np.all(high > [mean, deviation, p95])
 
