@@ -39,8 +39,8 @@ _PARTS = 1.0, 0.25, 0.0625
 _APART, _TRIES = 2.0, 5
 """Distance of the mean delays at which a maximum of the likelihood is looked for, in standard errors of the first
 estimate, and the most of them on a side."""
-_ROUNDS = 3
-"""Linearisations of least squares, and of the likelihood."""
+_ROUNDS, _AGAIN = 3, 2
+"""Linearisations of least squares, and then of the likelihood."""
 _STEPS = 40
 """Most steps of a maximisation."""
 _LEAST, _MOST = 40, 100
@@ -301,45 +301,59 @@ def _arrived(linearise: Linearise, x: np.ndarray, delay_s: float) -> Delays:
     best, step = 0, 1 if local(1)[0] > local(-1)[0] else -1
     while abs(best) < _TRIES and local(best + step)[0] > local(best)[0]:
         best += step
-    # Maximise it again with the model linearised at the maximum, on a grid around the delays there are.
-    _, likelihood, p = local(best)
-    for _ in range(_ROUNDS):
-        x, noise, share, grid = x + p[: len(x)], likelihood.noise(p), likelihood.shares(p), likelihood.grid
-        evidence = linearise(x, float(share @ grid))
-        grid, share = _support(evidence, grid, share, noise)
-        likelihood = Likelihood(evidence, grid)
-        p = likelihood.maximise(likelihood.start(noise, share))
-    x, noise, share = x + p[: len(x)], likelihood.noise(p), likelihood.shares(p)
+    # Linearise twice more, at the best of these and near the first delay: far steps may have looked too good.
+    ends = []
+    for start in {0, best}:
+        (_, likelihood, p), at = local(start), x
+        for _ in range(_AGAIN):
+            at, noise, share = at + p[: len(x)], likelihood.noise(p), likelihood.shares(p)
+            likelihood = Likelihood(linearise(at, float(share @ likelihood.grid)), likelihood.grid)
+            p = likelihood.maximise(likelihood.start(noise, share))
+        ends.append((likelihood(p)[0], likelihood, p, at))
+    _, likelihood, p, at = max(ends, key=lambda end: end[0])
+    x, noise, share, grid = at + p[: len(x)], likelihood.noise(p), likelihood.shares(p), likelihood.grid
     mean_s = float(share @ grid)
     # Errors of the estimate.
     deviation_s = float(np.sqrt(share @ (grid - mean_s) ** 2))
-    mean_error = _straight(evidence, mean_s, deviation_s, noise)[1]
+    mean_error = _straight(likelihood.evidence, mean_s, deviation_s, noise)[1]
     by_shape = share[:, None] * (likelihood.bumps - share @ likelihood.bumps)
     covariance = likelihood.covariance(p)[-by_shape.shape[1] :, -by_shape.shape[1] :]
     return Delays(x, grid, share, mean_error, by_shape, covariance, p[len(x) :], np.zeros(len(evidence.errors)))
 
 
 def _maximum(evidence: DelayEvidence, delay_s: float) -> tuple[float, Likelihood, np.ndarray]:
-    """Return the largest likelihood near a mean delay [s], the likelihood, and its point."""
-    grid, ones = np.linspace(evidence.delays[0], evidence.delays[-1], _MOST), np.ones(evidence.errors.shape[1])
-    likelihood = Likelihood(evidence, grid)
-    p = likelihood.start(ones, np.exp(-0.5 * ((grid - delay_s) / _FIRST_S) ** 2))
-    p[: likelihood.unknowns] = _straight(evidence, delay_s, _FIRST_S, ones, move_delay=False)[0][:-1]
-    p = likelihood.maximise(p)
-    return likelihood(p)[0], likelihood, p
+    """Return the largest likelihood near a mean delay [s], the likelihood, and its point.
 
-
-def _support(
-    evidence: DelayEvidence, grid: np.ndarray, share: np.ndarray, noise: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return a grid that covers the delays of all messages, finer than the resolution of a measurement, and shares."""
-    below, few = np.cumsum(share) / share.sum(), 0.3 / len(evidence.errors)
-    step = evidence.delays[1] - evidence.delays[0]
-    low, high = np.interp([few, 1 - few], below, grid) + np.array([-step, step])
+    The unknowns begin where they fit best with that delay. Then expectation and maximisation with a share for every
+    delay find the grid that covers the delays of all messages, finer than the resolution of a measurement.
+    """
+    delay_s = float(np.clip(delay_s, evidence.delays[0], evidence.delays[-1]))
+    count, fields, size = evidence.errors.shape
+    share, noise = np.full(size, 1.0 / size), np.ones(fields)
+    move = _straight(evidence, delay_s, _FIRST_S, noise, move_delay=False)[0][:-1]
+    for _ in range(_STEPS):
+        # Expectation: the probability of each delay for each measurement.
+        off = (evidence.errors + (evidence.jacobian @ move)[:, :, None]) / noise[None, :, None]
+        height = -0.5 * (off**2).sum(axis=1) + np.log(share + _FLOOR)
+        likely = np.exp(height - height.max(axis=1, keepdims=True))
+        likely /= likely.sum(axis=1, keepdims=True)
+        # Maximisation: shares, unknowns and noise.
+        share = likely.sum(axis=0) / count
+        J = (evidence.jacobian / noise[None, :, None]).reshape(-1, len(move))
+        error = (np.einsum("nk,nfk->nf", likely, evidence.errors) / noise).reshape(-1)
+        move = -np.linalg.solve(J.T @ J + evidence.prior + 1e-12 * np.eye(len(move)), J.T @ error)
+        off = evidence.errors + (evidence.jacobian @ move)[:, :, None]
+        noise = np.sqrt(np.einsum("nk,nfk->f", likely, off**2) / count)
+    below, few, step = np.cumsum(share), 0.3 / count, evidence.delays[1] - evidence.delays[0]
+    low, high = np.interp([few, 1 - few], below, evidence.delays) + np.array([-step, step])
     slopes = np.abs(np.diff(evidence.errors, axis=2)).mean(axis=2) / step / noise
     fine = 0.7 / max(float(np.quantile(np.sqrt((slopes**2).sum(axis=1)), 0.95)), 1e-9)
-    finer = np.linspace(low, high, int(np.clip((high - low) / fine, _LEAST, _MOST)))
-    return finer, np.interp(finer, grid, share / share.max())
+    points = int(np.clip((high - low) / fine, _LEAST, _MOST))
+    likelihood = Likelihood(evidence, np.linspace(low, high, points))
+    p = likelihood.start(noise, np.full(points, 1.0 / points))
+    p[: len(move)] = move
+    p = likelihood.maximise(p)
+    return likelihood(p)[0], likelihood, p
 
 
 def links(problem: Problem, x: np.ndarray) -> tuple[Link, ...]:
@@ -354,7 +368,7 @@ def links(problem: Problem, x: np.ndarray) -> tuple[Link, ...]:
     late, table = measured(problem.table), problem.table
     # Give both sides of the world half of the delay, so that those of single measurements can be shorter or longer.
     values = {n: np.asarray(v, np.float64) for n, v in table.decode(x).items()}
-    commands = [c.parameter.name for c in table.columns if c.parameter.side == "command"]
+    commands = [c.name for c in table.columns if c.side == "command"]
     half_s = (float(values[late]) + sum(float(values[n]) for n in commands)) / 2.0
     if commands and not table[late].free:
         values = values | {late: np.float64(half_s), commands[0]: np.float64(half_s)}
@@ -369,7 +383,7 @@ def links(problem: Problem, x: np.ndarray) -> tuple[Link, ...]:
 def measured(table: ParameterTable) -> str:
     """Return the name of the measurements' delay."""
     names = sorted({p.name for p in table if p.side == "measurement"})
-    if len(names) != 1 or not any(c.parameter.kind == "delay" for c in table.columns):
+    if len(names) != 1 or not any(c.kind == "delay" for c in table.columns):
         raise UsageError(
             f"links need one delay of the measurements and one that is identified, got {', '.join(names) or 'none'}",
             hint="leave --links out",
@@ -445,7 +459,7 @@ class _Watched:
     def __init__(self, problem: Problem, x: np.ndarray, late: str, delay_s: float) -> None:
         self._problem, self._point, self._late, self.delay_s = problem, x, late, delay_s
         self._segments = _side_by_side(problem)
-        self._moved = [i for i, c in enumerate(problem.table.columns) if c.parameter.kind != "delay"]
+        self._moved = [i for i, c in enumerate(problem.table.columns) if c.kind != "delay"]
         self._states = 2 * len(problem.channels) if problem.config.initial_state == "free" else 0
         self._counts = problem.ts[self._segments] >= 0.0
         same = np.ones(self._counts.shape, bool)

@@ -76,7 +76,7 @@ def ways(table: ParameterTable, causes: Causes) -> list[Way]:
 
     A cause that moves unidentified parameters is not tested.
     """
-    kinds = [c.parameter.kind for c in table.columns]
+    kinds = [c.kind for c in table.columns]
     names = [ROUND_TRIP if k == "delay" and kinds.count(k) == 1 else n for k, n in zip(kinds, table.names, strict=True)]
     changes = [Way(n, np.eye(len(table))[i]) for i, n in enumerate(names)]
     for cause, shares in causes.items():
@@ -133,10 +133,10 @@ def _with_known(posterior: Posterior, table: ParameterTable) -> Posterior:
         )
 
     at = [table.names.index(name) for name in posterior.names]
-    mean = np.array([c.parameter.to_scale(c.parameter.nominal) for c in table.columns])
+    mean = np.array([c.to_scale(c.nominal) for c in table.columns])
     covariance = np.zeros((len(mean), len(mean)))
     mean[at], covariance[np.ix_(at, at)] = posterior.mean, posterior.covariance
-    transform: tuple[Transform, ...] = tuple(c.parameter.transform for c in table.columns)
+    transform: tuple[Transform, ...] = tuple(c.transform for c in table.columns)
     return Posterior(table.names, transform, mean, covariance, table.low, table.high)
 
 
@@ -282,7 +282,7 @@ def _absolute(name: str, table: ParameterTable) -> bool:
     """Return whether a change is no factor: of a delay, a payload, an offset."""
     if name not in table.names:
         return name == ROUND_TRIP
-    return table.columns[table.names.index(name)].parameter.transform != "log"
+    return table.columns[table.names.index(name)].transform != "log"
 
 
 def _values(
@@ -290,7 +290,7 @@ def _values(
 ) -> tuple[str, float, float, float, float]:
     """Return the unit, the value before, and those after moving by ``ends`` on the scale; of a cause factors."""
     if name == ROUND_TRIP and name not in posterior.names:
-        total = sum(x for x, c in zip(posterior.mean, table.columns, strict=True) if c.parameter.kind == "delay")
+        total = sum(x for x, c in zip(posterior.mean, table.columns, strict=True) if c.kind == "delay")
         total += sum(p.nominal for p in table if p.kind == "delay" and not p.free)
         now, low, high = (float(max(total + e, 0.0)) for e in ends)
         return "s", float(total), now, low, high
@@ -298,6 +298,6 @@ def _values(
         now, low, high = (float(np.exp(e)) for e in ends)
         return "", 1.0, now, low, high
     i = posterior.names.index(name)
-    parameter = table.columns[i].parameter
+    parameter = table.columns[i]
     before, now, low, high = (float(parameter.from_scale(posterior.mean[i] + e)) for e in (0.0, *ends))
     return parameter.unit, before, now, low, high

@@ -4,10 +4,9 @@ scipy's trust-region method takes the steps of a descent, within the bounds and 
 decides is that with initial states solved for at the point itself.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
@@ -52,10 +51,8 @@ _LOSSES = {"squared": "linear", "huber": "soft_l1", "cauchy": "cauchy"}
 OnStep = Callable[[float, np.ndarray], None]
 """Called with the best loss and point ``(P,)`` so far, after every evaluation."""
 OnProgress = Callable[[str, float, float, np.ndarray], None]
-"""Called with the phase (``search``, ``refine`` or ``compiling``), the share of it done since the last call, and the
+"""Called with the phase (``search`` or ``refine``), the share of it done since the last call, and the
 best loss and point so far."""
-Value: TypeAlias = float | list[float]
-"""The value of a parameter: a number, or a list with one number a recording."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +99,7 @@ class Fit:
     converged: bool
 
     @property
-    def values(self) -> dict[str, Value]:
+    def values(self) -> dict[str, float]:
         """The estimate by name."""
         return as_numbers(self.problem.table, self.x)
 
@@ -116,8 +113,8 @@ class Fit:
         return from_linearised(self.problem, self.problem.linearise(self.x))
 
 
-def as_numbers(table: ParameterTable, x: np.ndarray, present: np.ndarray | None = None) -> dict[str, Value]:
-    """Return values by name as Python numbers; lists for parameters that each recording has its own value of.
+def as_numbers(table: ParameterTable, x: np.ndarray, present: np.ndarray | None = None) -> dict[str, float]:
+    """Return values by name as Python numbers.
 
     Args:
         x: Shape ``(P,)``: a point on the parameters' scales.
@@ -184,7 +181,7 @@ def fit(
     return Fit(problem, x, loss, result, tuple(refined), windows, left, converged)
 
 
-def refit(problem: Problem, present: np.ndarray, near: np.ndarray) -> dict[str, Value]:
+def refit(problem: Problem, present: np.ndarray, near: np.ndarray) -> dict[str, float]:
     """Return a rough estimate of fewer parameters; the others have their values in a model without them.
 
     Args:
@@ -212,8 +209,7 @@ def run_search(problem: Problem, start: np.ndarray, report: OnProgress | None = 
         if report:
             report("search", 1.0 / config.generations, best, x)
 
-    with _compiling(problem, report, "search", start):
-        result = search(losses, start, table.low, table.high, config, advance)
+    result = search(losses, start, table.low, table.high, config, advance)
     result = replace(result, loss=problem.loss(result.x))
     if report:  # this loss is exact; a generation's losses linearise initial states at its middle
         report("search", 0.0, result.loss, result.x)
@@ -290,7 +286,7 @@ def _pull(table: ParameterTable, part: Part) -> np.ndarray:
     A deviation of the bounds' width is too wide to matter to a parameter that the log determines. Without it the first
     steps carry one that hardly acts anywhere, and recordings that depend on it are predicted wrongly.
     """
-    pulled = np.array([c.parameter.kind != "delay" and c.parameter.prior is None for c in table.columns], bool)
+    pulled = np.array([c.kind != "delay" and c.prior is None for c in table.columns], bool)
     return np.where(pulled & part.present, 1.0 / table.span, 0.0)
 
 
@@ -374,7 +370,7 @@ class _Descent:
             return x
         # Pull to the nominal values by the residuals that the next step leaves, if the slope is right.
         shape = (len(self._part.live), -1, len(problem.fields))
-        priors = sum(c.parameter.prior is not None for c in table.columns)
+        priors = sum(c.prior is not None for c in table.columns)
         self._deviation = deviation(left[: len(left) - priors].reshape(shape), problem.residuals.compared(self._part))
         rows, pull = np.flatnonzero(self._weight), self._deviation * self._weight
 
@@ -407,7 +403,7 @@ def with_terms(table: ParameterTable, x: np.ndarray, present: np.ndarray) -> np.
     Args:
         present: Shape ``(T,)``, bool: which of the table's terms.
     """
-    off = [p.to_scale(min(max(p.without, p.low), p.high)) for p in (c.parameter for c in table.columns)]
+    off = [p.to_scale(min(max(p.without, p.low), p.high)) for p in (c for c in table.columns)]
     return np.where(table.of_terms(present), x, off)
 
 
@@ -440,20 +436,6 @@ def _refine(problem: Problem, starts: np.ndarray, report: OnProgress | None, rou
         if report:
             report("refine", step, best, x)
 
-    with _compiling(problem, report, "refine", starts[0]):
-        if roughly is None:
-            return refine(problem, starts, on_step=advance)
-        return refine(problem, starts, roughly, settle=False, gain=_ROUGHLY, on_step=advance)
-
-
-@contextmanager
-def _compiling(problem: Problem, report: OnProgress | None, then: str, x: np.ndarray) -> Iterator[None]:
-    """Report compilations inside of a ``with`` block, after which the phase ``then`` continues."""
-
-    def on_compile(started: bool) -> None:
-        if report:
-            report("compiling" if started else then, 0.0, float("inf"), x)
-
-    problem.residuals.on_compile = on_compile
-    yield
-    problem.residuals.on_compile = None
+    if roughly is None:
+        return refine(problem, starts, on_step=advance)
+    return refine(problem, starts, roughly, settle=False, gain=_ROUGHLY, on_step=advance)

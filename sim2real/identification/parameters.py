@@ -14,7 +14,7 @@ from sim2real.artifacts.posterior import TRANSFORMS, Posterior, Transform, from_
 from sim2real.errors import UsageError
 from sim2real.identification.parameter_paths import set_leaf
 from sim2real.later import jax, jnp
-from sim2real.types import Array, PyTree
+from sim2real.types import PyTree
 
 _BELOW, _BEYOND = 4.0, 50.0
 """Factors of the bounds of a limit below and above the largest value that recordings reach. Inertia and friction that
@@ -37,7 +37,6 @@ class Parameter:
         excite: Motion that determines it, for advice; "": no advice.
         leaf: Place of the value in the nodes' parameters, ``node.field.field[index]``; None: the model places it.
         prior: A distrax distribution over the value; None: uniform on the scale, within the bounds.
-        per_recording: Whether each recording has its own value.
         free: Whether it is identified; else it stays at ``nominal``.
         side: Of a delay: ``command`` (from the policy to the world) or ``measurement`` (from the world to the policy).
         term: Name of the optional term of the model that it belongs to, such as ``cogging``; "": none.
@@ -61,7 +60,6 @@ class Parameter:
     about: str = ""
     leaf: str | None = None
     prior: Any = None
-    per_recording: bool = False
     free: bool = True
     side: Literal["", "command", "measurement"] = ""
     term: str = ""
@@ -118,34 +116,18 @@ class Parameter:
         return float(from_scale(self.transform, x))
 
 
-@dataclass(frozen=True)
-class Column:
-    """One entry of the searched vector: a parameter, of one recording if each has its own."""
-
-    parameter: Parameter
-    recording: int | None = None
-
-    @property
-    def label(self) -> str:
-        """The parameter's name, with ``@recording`` where each has its own."""
-        return self.parameter.name if self.recording is None else f"{self.parameter.name}@{self.recording}"
-
-
 class ParameterTable:
     """Parameters in a fixed order, and the map from points of the free ones, each on its own scale, to values."""
 
-    def __init__(self, parameters: Iterable[Parameter], recordings: int = 1) -> None:
+    def __init__(self, parameters: Iterable[Parameter]) -> None:
         self.parameters = tuple(parameters)
-        self.recordings = recordings
         names = [p.name for p in self.parameters]
         if len(set(names)) != len(names):
             raise UsageError(f"parameter names must differ: {', '.join(names)}")
-        self.columns = tuple(
-            Column(p, r) for p in self.parameters if p.free for r in (range(recordings) if p.per_recording else (None,))
-        )
-        self.names = tuple(c.label for c in self.columns)
-        self._low = np.array([c.parameter.to_scale(c.parameter.low) for c in self.columns])
-        self._high = np.array([c.parameter.to_scale(c.parameter.high) for c in self.columns])
+        self.columns = tuple(p for p in self.parameters if p.free)
+        self.names = tuple(p.name for p in self.columns)
+        self._low = np.array([c.to_scale(c.low) for c in self.columns])
+        self._high = np.array([c.to_scale(c.high) for c in self.columns])
 
     def __len__(self) -> int:
         return len(self.columns)
@@ -159,33 +141,27 @@ class ParameterTable:
                 return p
         raise UsageError(f"unknown parameter {name!r}. Available: {', '.join(p.name for p in self.parameters)}")
 
-    def for_recordings(self, recordings: int) -> ParameterTable:
-        """Return the table for another number of recordings."""
-        return ParameterTable(self.parameters, recordings)
-
     def with_fixed(self, values: Mapping[str, float]) -> ParameterTable:
         """Return the table with some parameters fixed at values."""
         changed = {p.name: p for p in self.parameters}
         for name, value in values.items():
             changed[name] = replace(self[name], nominal=float(value), free=False)
-        return ParameterTable(changed.values(), self.recordings)
+        return ParameterTable(changed.values())
 
     def with_free(self, name: str) -> ParameterTable:
         """Return the table with one more parameter to identify."""
-        return ParameterTable((replace(p, free=p.free or p.name == name) for p in self.parameters), self.recordings)
+        return ParameterTable(replace(p, free=p.free or p.name == name) for p in self.parameters)
 
     def with_nominal(self, values: Mapping[str, float]) -> ParameterTable:
         """Return the table with other nominal values, which are starts of a search; unknown names are ignored."""
         return ParameterTable(
             (replace(p, nominal=float(values[p.name]), begin=None) if p.name in values else p for p in self.parameters),
-            self.recordings,
         )
 
     def with_begin(self, values: Mapping[str, float]) -> ParameterTable:
         """Return the table with other starts of a search; unknown names are ignored."""
         return ParameterTable(
             (replace(p, begin=float(values[p.name])) if p.name in values else p for p in self.parameters),
-            self.recordings,
         )
 
     def with_bounds(self, bounds: Mapping[str, tuple[float, float]]) -> ParameterTable:
@@ -211,7 +187,7 @@ class ParameterTable:
                     hint="narrow them, or allow longer delays with --max-delay-s",
                 )
             changed[name] = p
-        return ParameterTable(changed.values(), self.recordings)
+        return ParameterTable(changed.values())
 
     def with_reached(self, reached: Mapping[str, float]) -> ParameterTable:
         """Return the table with bounds for absent limits, and starts of their search, by what recordings reach.
@@ -223,12 +199,12 @@ class ParameterTable:
             replace(p, low=most / _BELOW, high=most * _BEYOND, begin=most) if most > 0.0 and p.high >= p.without else p
             for p, most in ((p, reached.get(p.name, 0.0)) for p in self.parameters)
         )
-        return ParameterTable(rows, self.recordings)
+        return ParameterTable(rows)
 
     @property
     def terms(self) -> tuple[str, ...]:
         """Names of the optional terms that have free parameters, in the order of the table."""
-        return tuple(dict.fromkeys(c.parameter.term for c in self.columns if c.parameter.term))
+        return tuple(dict.fromkeys(c.term for c in self.columns if c.term))
 
     def with_terms(self, names: Iterable[str]) -> ParameterTable:
         """Return the table with some optional terms; parameters of other terms are fixed at their values without it.
@@ -244,7 +220,7 @@ class ParameterTable:
             p if not p.term else replace(p, free=True) if p.term in names else replace(p, nominal=p.without, free=False)
             for p in self.parameters
         )
-        return ParameterTable(rows, self.recordings)
+        return ParameterTable(rows)
 
     def of_terms(self, present: np.ndarray) -> np.ndarray:
         """Return which entries are part of a model with some of ``terms``, ``(P,)``, bool.
@@ -253,7 +229,7 @@ class ParameterTable:
             present: Shape ``(T,)``, bool: which terms.
         """
         chosen = dict(zip(self.terms, present, strict=True)) | {"": True}
-        return np.array([chosen[c.parameter.term] for c in self.columns], bool)
+        return np.array([chosen[c.term] for c in self.columns], bool)
 
     def of_limits(self) -> np.ndarray:
         """Return which of ``terms`` are limits, ``(T,)``, bool."""
@@ -262,33 +238,15 @@ class ParameterTable:
     def decode(self, x: np.ndarray, present: np.ndarray | None = None) -> dict[str, np.ndarray]:
         """Return values by name at points on the parameters' scales ``(..., P)``, leaves ``(...)``.
 
-        A parameter that each recording has its own value of has leaves ``(..., recordings)``.
-
         Args:
             present: Shape ``(P,)``, bool: others have their values in a model without them; default: all are kept.
         """
         x = np.asarray(x, np.float64)
-        columns: dict[str, list[np.ndarray]] = {}
-        for i, c in enumerate(self.columns):
-            value = from_scale(c.parameter.transform, x[..., i])
-            if present is not None and not present[i]:
-                value = np.full_like(value, c.parameter.without)
-            columns.setdefault(c.parameter.name, []).append(value)
-        # Add the fixed parameters, and stack those that each recording has its own value of.
-        values, copies = {}, x.shape[:-1]
-        for p in self.parameters:
-            column = columns.get(p.name)
-            if column is None:
-                values[p.name] = np.full((*copies, self.recordings) if p.per_recording else copies, p.nominal)
-            else:
-                values[p.name] = np.stack(column, axis=-1) if p.per_recording else column[0]
+        values = {p.name: np.full(x.shape[:-1], p.nominal) for p in self.parameters}
+        for i, p in enumerate(self.columns):
+            there = present is None or present[i]
+            values[p.name] = from_scale(p.transform, x[..., i]) if there else np.full(x.shape[:-1], p.without)
         return values
-
-    def of_recording(self, values: Mapping[str, Array], recording: Array | int) -> dict[str, Array]:
-        """Return the values of one recording, each a scalar."""
-        broadcast = lambda v: jnp.broadcast_to(jnp.asarray(v), (self.recordings,))  # noqa: E731
-        single = {p.name: broadcast(values[p.name])[recording] for p in self.parameters if p.per_recording}
-        return {p.name: single.get(p.name, values[p.name]) for p in self.parameters}
 
     def placed(self, params: Mapping[str, PyTree], values: Mapping[str, ArrayLike]) -> dict[str, PyTree]:
         """Return nodes' parameters with each value at its parameter's ``leaf``."""
@@ -300,10 +258,9 @@ class ParameterTable:
 
     def encode(self, values: Mapping[str, ArrayLike]) -> np.ndarray:
         """Return the point ``(P,)`` on the parameters' scales of values by name, within the bounds."""
-        arrays = [np.ravel(np.asarray(values[c.parameter.name], np.float64)) for c in self.columns]
-        at = [v[min(c.recording or 0, v.size - 1)] for v, c in zip(arrays, self.columns, strict=True)]
-        inside = [min(max(v, c.parameter.low), c.parameter.high) for v, c in zip(at, self.columns, strict=True)]
-        return self.within(np.array([c.parameter.to_scale(v) for v, c in zip(inside, self.columns, strict=True)]))
+        at = [float(np.squeeze(values[p.name])) for p in self.columns]
+        inside = [p.to_scale(min(max(v, p.low), p.high)) for v, p in zip(at, self.columns, strict=True)]
+        return self.within(np.array(inside))
 
     def within(self, x: np.ndarray) -> np.ndarray:
         """Return points on the parameters' scales ``(..., P)``, clipped to the bounds."""
@@ -316,7 +273,7 @@ class ParameterTable:
             x: Shape ``(P,)``: the estimate, on the parameters' scales.
             covariance: Shape ``(P, P)``, on the parameters' scales.
         """
-        transform: tuple[Transform, ...] = tuple(c.parameter.transform for c in self.columns)
+        transform: tuple[Transform, ...] = tuple(c.transform for c in self.columns)
         return Posterior(self.names, transform, np.asarray(x), covariance, self.low, self.high)
 
     def start(self, share: float = 0.25) -> np.ndarray:
@@ -335,7 +292,7 @@ class ParameterTable:
 
     def starts(self) -> np.ndarray:
         """Return starts of a descent without a search, ``(K, P)``: with short delays, and with long ones."""
-        delayed = any(c.parameter.kind == "delay" and c.parameter.begin is None for c in self.columns)
+        delayed = any(c.kind == "delay" and c.begin is None for c in self.columns)
         return np.stack([self.start(share) for share in ((0.25, 0.75) if delayed else (0.25,))])
 
     def nominal(self) -> np.ndarray:
@@ -344,19 +301,19 @@ class ParameterTable:
 
     def prior_residuals(self, x: np.ndarray) -> np.ndarray:
         """Return residuals ``(Q,)`` at ``x (P,)`` whose half sum of squares is minus the log prior, but a constant."""
-        with_prior = [(i, c) for i, c in enumerate(self.columns) if c.parameter.prior is not None]
-        return np.array([_prior_residual(c.parameter.prior, c.parameter.from_scale(x[i])) for i, c in with_prior])
+        with_prior = [(i, c) for i, c in enumerate(self.columns) if c.prior is not None]
+        return np.array([_prior_residual(c.prior, c.from_scale(x[i])) for i, c in with_prior])
 
     def unscale(self, x: np.ndarray) -> np.ndarray:
         """Return values for points on the parameters' scales ``(..., P)``, clipped to the bounds."""
         inside = self.within(x)
-        values = [from_scale(c.parameter.transform, inside[..., i]) for i, c in enumerate(self.columns)]
+        values = [from_scale(c.transform, inside[..., i]) for i, c in enumerate(self.columns)]
         return np.stack(values, axis=-1)
 
     def slope(self, x: np.ndarray) -> np.ndarray:
         """Return d value / d scale at points on the parameters' scales, ``(P,)``."""
         values = self.unscale(x)
-        return np.array([TRANSFORMS[c.parameter.transform][2](v) for c, v in zip(self.columns, values, strict=True)])
+        return np.array([TRANSFORMS[c.transform][2](v) for c, v in zip(self.columns, values, strict=True)])
 
     @property
     def low(self) -> np.ndarray:

@@ -67,7 +67,7 @@ class Problem:
         like: Problem | None = None,
     ) -> None:
         self.model, self.config, self._recordings = model, config, recordings
-        self.table = like.table if like else (table or model.parameters).for_recordings(len(recordings))
+        self.table = like.table if like else (table or model.parameters)
         self.rollouts = like.rollouts if like else self._rollouts()
         nodes = self.rollouts.graph.nodes
         # Commands sent before a segment still act in it, up to the largest delay.

@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 from sim2real.identification.config import Loss
-from sim2real.identification.rollouts import OnCompile, Rollouts
+from sim2real.identification.rollouts import Rollouts
 from sim2real.identification.segments import Data
 from sim2real.types import MjModel
 
@@ -195,7 +195,6 @@ class Residuals:
         self._state_groups: Groups = like._state_groups if like else Groups(apart, by_tree=True)
         self._last_states: list[tuple[bytes, bool, _States]] = []
         self._last: list[tuple[np.ndarray, Part, Linearised, np.ndarray]] = []
-        self.on_compile: OnCompile | None = None
 
     # -- what a fit asks for
 
@@ -298,15 +297,14 @@ class Residuals:
         """
         values = self._table.decode(np.repeat(x[None], len(rows), axis=0), part.present)
         for i, c in enumerate(self._table.columns):
-            if c.recording is None:
-                values[c.label] = np.where(np.isnan(rows[:, i]), values[c.label], rows[:, i])
+            values[c.name] = np.where(np.isnan(rows[:, i]), values[c.name], rows[:, i])
         raw = self._projected(values, self._fitted_states(x, part, fresh=True), part)
         return robust(raw, self._config.loss, self._config.reach)[0]
 
     def liveliest(self, part: Part, most: int | None = None) -> Part:
         """Return the segments in which the channels move most, of each channel in turn.
 
-        If these are few, one of each recording is among them; of many recordings only if each has own parameters.
+        If recordings are few, one segment of each is among them.
 
         Args:
             most: Number of segments; default: as many as suffice for a start.
@@ -320,8 +318,7 @@ class Residuals:
         order = np.argsort(-np.array(reaches), axis=1).T.reshape(-1)  # the best of each channel, the second best, ...
         recordings = np.asarray(self._data.recording)[segments]
         firsts = order[np.unique(recordings[order], return_index=True)[1]]
-        count, alone = most or max(_SEARCHED, 2 * len(reaches)), any(p.per_recording for p in self._table)
-        count = max(count, len(firsts)) if alone else count
+        count = most or max(_SEARCHED, 2 * len(reaches))
         turns = dict.fromkeys([*(firsts if len(firsts) <= count else ()), *order.tolist()])
         chosen = np.zeros(len(part.live), bool)
         chosen[live[list(turns)[:count]]] = True
@@ -333,7 +330,7 @@ class Residuals:
 
     def errors(self, values: Mapping[str, np.ndarray], segments: np.ndarray, shift: np.ndarray) -> np.ndarray:
         """Return ``Rollouts.errors`` without the padding of the programs."""
-        found = self._rollouts.errors(values, segments, shift, self._data, self.on_compile)[:, : self._ts.shape[1]]
+        found = self._rollouts.errors(values, segments, shift, self._data)[:, : self._ts.shape[1]]
         return np.where((self._ts[segments] >= 0.0)[..., None], found, 0.0)
 
     # -- finite differences by parameters

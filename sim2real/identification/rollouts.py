@@ -6,8 +6,7 @@ the segments as an argument, so they depend on shapes alone, and copies are padd
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -30,8 +29,6 @@ _NEEDED = ("open_loop", "fields", "start", "controls", "message")
 _ON_C, _COMPILED = (24, 128, 512), (32, 256)
 """Copies in one call of a program. C: a Jacobian of 20 logs took 24 s of processor time with 128 at a time, 18 s with
 512. Compiled: each size is a program that contains the physics."""
-OnCompile = Callable[[bool], None]
-"""Called with True before a program is compiled, and with False afterwards."""
 
 
 @dataclass(frozen=True)
@@ -85,34 +82,13 @@ def _open_loop_world(nodes: Mapping[str, BaseNode], messages: Mapping[str, PyTre
     return worlds[0]
 
 
-class Program:
-    """A function that is compiled for each form of its arguments: their tree, shapes and dtypes.
+def jitted(function: Callable[..., PyTree]) -> Any:
+    """Return a function that XLA compiles.
 
     On a CPU, XLA's fusion emitters are off (jaxlib 0.10), as programs that run for seconds then need half the time.
     """
-
-    def __init__(self, function: Callable[..., PyTree]) -> None:
-        old = jax.default_backend() == "cpu" and jax.__version__.startswith("0.10.")
-        self._jitted = jax.jit(function, compiler_options={"xla_cpu_use_fusion_emitters": False} if old else None)
-        self._compiled: dict[Any, Any] = {}
-
-    def __call__(self, *args: Any, on_compile: OnCompile | None = None) -> PyTree:
-        """Run the function, compiled at the first call with arguments of this form."""
-        leaves, tree = jax.tree_util.tree_flatten(args)
-        form = (tree, tuple((a.shape, a.dtype, a.weak_type) for a in map(jax.typeof, leaves)))
-        if form not in self._compiled:
-            with compiling(on_compile):
-                self._compiled[form] = self._jitted.lower(*args).compile()
-        return self._compiled[form](*args)
-
-
-@contextmanager
-def compiling(on_compile: OnCompile | None) -> Iterator[None]:
-    """Report that a program is compiled inside a ``with`` block."""
-    report = on_compile or (lambda started: None)
-    report(True)
-    yield
-    report(False)
+    old = jax.default_backend() == "cpu" and jax.__version__.startswith("0.10.")
+    return jax.jit(function, compiler_options={"xla_cpu_use_fusion_emitters": False} if old else None)
 
 
 class PhysicsInputs(NamedTuple):
@@ -199,7 +175,7 @@ class Rollouts:
         sigmas = [c.position_sigma for c in model.channels] + [c.velocity_sigma for c in model.channels]
         self.prior = 30.0 * np.array(sigmas, np.float64)
         self.fields = [(field, sigma, c.of) for c in model.channels for field, sigma in c.fields]
-        self.programs: dict[str, Program] = {}
+        self.programs: dict[str, Any] = {}
         self._late = [p.name for p in table if p.side == "measurement"]
 
     def errors(
@@ -208,7 +184,6 @@ class Rollouts:
         segment: np.ndarray,
         shift: np.ndarray,
         data: Data,
-        on_compile: OnCompile | None = None,
     ) -> np.ndarray:
         """Return prediction minus measurement, in deviations of the measurement, ``(N, K, F)``; 0 where not compared.
 
@@ -227,7 +202,7 @@ class Rollouts:
             copies = padded(_single(arguments), next(size for size in sizes if count <= size))
             if self._on_c is None:
                 program = self._program("errors", self._compared_graph, (0, 0, 0, None))
-                errors = program(*copies, data, on_compile=on_compile)
+                errors = program(*copies, data)
             else:
                 before = self._program("inputs", self._physics_inputs, (0, 0, 0, None))
                 inputs = jax.tree_util.tree_map(lambda a, n=count: np.asarray(a)[:n], before(*copies, data))
@@ -245,9 +220,9 @@ class Rollouts:
         copies = padded(_single((dict(values), segment, shift * self.prior)), size)
         return np.asarray(program(*copies, data), np.float64)[: len(segment)]
 
-    def _program(self, name: str, function: Callable[..., PyTree], axes: tuple[int | None, ...]) -> Program:
+    def _program(self, name: str, function: Callable[..., PyTree], axes: tuple[int | None, ...]) -> Any:
         if name not in self.programs:
-            self.programs[name] = Program(jax.vmap(function, axes))
+            self.programs[name] = jitted(jax.vmap(function, axes))
         return self.programs[name]
 
     # -- one copy, traced
@@ -255,9 +230,8 @@ class Rollouts:
     def _started(
         self, values: Mapping[str, Array], eps: Array, shift: Array, data: Data
     ) -> tuple[dict[str, PyTree], jax.Array]:
-        """Return the parameters of a segment's recording, and its initial state."""
-        values_ = self.table.of_recording(values, data.recording[eps])
-        return values_, self._estimated_start(eps, sum(values_[n] for n in self._late), data) + shift
+        """Return the parameters, and the initial state of a segment."""
+        return dict(values), self._estimated_start(eps, sum(values[n] for n in self._late), data) + shift
 
     def _estimated_start(self, eps: Array, delay_s: Scalar, data: Data) -> jax.Array:
         """Return the initial state ``(2 * channels,)`` as measured around the start, samples being ``delay_s`` late."""

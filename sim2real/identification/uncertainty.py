@@ -170,9 +170,8 @@ def _with_absent(spread: Uncertainty, table: ParameterTable, at: Linearised, var
     )
     information, values, slope = J.T @ J / variance, table.unscale(at.x), np.abs(table.slope(at.x))
     prior, freely = at.prior, np.diag(at.prior)
-    for i, c in enumerate(table.columns):
-        p = c.parameter
-        if verdicts[i] == OK or c.recording is not None or p.narrowed:
+    for i, p in enumerate(table.columns):
+        if verdicts[i] == OK or p.narrowed:
             continue
         if p.limits and information[i, i] * table.span[i] ** 2 < 1.0 / VAGUE**2:
             verdicts[i], low[i], high[i] = NOT_REACHED, values[i], p.high
@@ -292,11 +291,10 @@ def compare_recordings(problem: Problem, at: Linearised) -> tuple[Quantity, ...]
         root = root_of_inverse(J.T @ J / loss_variance(problem, left) + at.prior)
         alone.append((table.within(at.x + step), root @ root.T))
     rows = []
-    for i, c in enumerate(table.columns):
-        if c.recording is None:
-            values = np.array([table.unscale(x)[i] for x, _ in alone])
-            errors = np.array([np.sqrt(cov[i, i]) * abs(table.slope(x)[i]) for x, cov in alone])
-            rows.append(aggregate(values, errors, c.label, c.parameter.unit))
+    for i, p in enumerate(table.columns):
+        values = np.array([table.unscale(x)[i] for x, _ in alone])
+        errors = np.array([np.sqrt(cov[i, i]) * abs(table.slope(x)[i]) for x, cov in alone])
+        rows.append(aggregate(values, errors, p.name, p.unit))
     return tuple(rows)
 
 

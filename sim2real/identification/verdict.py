@@ -132,11 +132,11 @@ def judge(
             "part, and intervals follow how much estimates vary from block to block"
         )
     # The first rule that holds decides the status, and its sentences come first. Wider bounds do not help a model that
-    # lacks a term, as it bends its other parameters; nor does another recording before the bounds are right.
+    # lacks a term, as it bends its other parameters; nor does another recording before terms and bounds are right.
     lacking = [*lacks.reasons, *exceeded]
     rules: tuple[tuple[bool, Status, Sequence[str]], ...] = (
-        (improves and not bounded and bool(undetermined), RECORD, undetermined),
         (bool(lacks.flags), CHANGE, lacking),
+        (improves and not bounded and bool(undetermined), RECORD, undetermined),
         (not improves, CHANGE, errors),
         (bool(bounded), CHANGE, bounded),
         (lacks.unexplained, CHANGE, lacking),
@@ -173,7 +173,7 @@ def _absent(table: ParameterTable, spread: Uncertainty) -> list[str]:
     """Return a sentence about each parameter that may be absent."""
     messages = []
     for i, name in enumerate(table.names):
-        unit = table.columns[i].parameter.unit
+        unit = table.columns[i].unit
         if spread.verdict[i] == ABSENT:
             bound = f"at most {spread.high[i]:.2g} {unit} (95 %)"
             messages.append(f"{name} is small: {bound}, and it may be 0")
@@ -243,13 +243,13 @@ def _at_bounds(
     for i in determined:
         if spread.verdict[i] != BOUND:
             continue
-        label, p = table.columns[i].label, table.columns[i].parameter
+        p = table.columns[i]
         upper = bool(table.high[i] - x[i] < x[i] - table.low[i])
         if is_physical(p, upper):
-            at_zero.append(label)
+            at_zero.append(p.name)
         else:
             flags.append("" if p.name in widened else way_out(p, upper, max_delay_s))
-            messages.append(_bound(label, upper, f"{p.high if upper else p.low:.4g} {p.unit}", flags[-1]))
+            messages.append(_bound(p.name, upper, f"{p.high if upper else p.low:.4g} {p.unit}", flags[-1]))
     return messages, at_zero, " ".join(dict.fromkeys(f for f in flags if f))
 
 

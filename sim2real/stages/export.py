@@ -16,7 +16,7 @@ from sim2real.graph.episode import Episode
 from sim2real.identification.export.card import differing, json_document, write_card
 from sim2real.identification.export.mjcf import Late, late_mjcf
 from sim2real.identification.export.targets import source_of
-from sim2real.identification.export.terms import find_delays, find_terms, values_of
+from sim2real.identification.export.terms import find_delays, find_terms
 from sim2real.identification.model import IdentifiableModel
 from sim2real.identification.parameters import ParameterTable
 from sim2real.installation import version
@@ -86,7 +86,7 @@ def write_export(
         note(f"verdict: {status}; the file contains the verdict, too")
     # Put the estimates into the robot's model; optional terms that were not identified are switched off.
     off, sides = {p.name: p.nominal for p in model.parameters}, {p.name: p.side for p in model.parameters}
-    text = robot.identified_mjcf({**off, **values_of(identification)})
+    text = robot.identified_mjcf({**off, **identification.values})
     terms = None if text is None else find_terms(identification, lambda values: _text(robot, {**off, **values}), sides)
     # Write the format: JSON and a card need no model, the others need one.
     if to in ("json", "card"):
@@ -129,7 +129,7 @@ def write_model_card(
     """
     if folder.is_file() or (folder.is_dir() and any(folder.iterdir()) and not (folder / "card.json").is_file()):
         raise UsageError(f"{folder} is there and holds no model card", hint="name another folder with --out")
-    plain = robot.plain_simulation({p.name: p.nominal for p in model.parameters} | values_of(identification))
+    plain = robot.plain_simulation({p.name: p.nominal for p in model.parameters} | identification.values)
     card, signals = write_card(
         folder, identification, model, plain, document, _session(identification, SENSOR, run_dir)
     )
@@ -186,7 +186,7 @@ def _text(robot: RecordedRobot, values: Mapping[str, float]) -> str:
 def _no_model(identification: Identification, table: ParameterTable, to: str) -> UsageError:
     """Return the error for a robot whose world is not MuJoCo's: it names what an MJCF would lack."""
     leaves = {p.name: str(p.leaf).rpartition(".")[2].partition("[")[0] for p in table if p.leaf}
-    lost = [p.name for p in identification.parameters if leaves.get(p.name.partition("@")[0], "delay") not in _PLAIN]
+    lost = [p.name for p in identification.parameters if leaves.get(p.name, "delay") not in _PLAIN]
     return UsageError(
         f"the world of pipeline {identification.pipeline!r} is not MuJoCo's, so there is no model to export to "
         f"{to}. Joints and drives of MuJoCo's have nothing for: {', '.join(lost) or 'its equations of motion'}",

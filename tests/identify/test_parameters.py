@@ -103,43 +103,14 @@ def test_delays_start_at_a_quarter_of_their_interval():
 
 @pytest.fixture
 def shared():
-    """One shared, one per recording, one fixed; three recordings."""
+    """Two to identify, and a fixed one."""
     return ParameterTable(
         [
             Parameter("gain", "1", 2.0, 1.0, 4.0),
-            Parameter("offset", "rad", 0.1, -1.0, 1.0, "linear", "measurement", per_recording=True),
+            Parameter("offset", "rad", 0.1, -1.0, 1.0, "linear", "measurement"),
             Parameter("mass", "kg", 7.0, 1.0, 9.0, free=False),
-        ],
-        recordings=3,
+        ]
     )
-
-
-def test_each_recording_has_its_column(shared):
-    assert shared.names == ("gain", "offset@0", "offset@1", "offset@2")
-    assert len(shared) == 4
-    values = {"gain": 3.0, "offset": np.array([-0.5, 0.2, 0.7]), "mass": 7.0}
-    back = shared.decode(shared.encode(values))
-    np.testing.assert_allclose(back["offset"], values["offset"], atol=1e-5)
-    for r, offset in enumerate(values["offset"]):
-        own = shared.of_recording(back, r)
-        assert {n: np.shape(v) for n, v in own.items()} == {"gain": (), "offset": (), "mass": ()}
-        assert float(own["offset"]) == pytest.approx(offset, abs=1e-5)
-        assert float(own["gain"]) == pytest.approx(3.0, rel=1e-5)
-    picked = jax.vmap(lambda r: shared.of_recording(back, r)["offset"])(jnp.array([2, 0]))
-    np.testing.assert_allclose(picked, [0.7, -0.5], atol=1e-5)
-
-
-def test_one_value_for_all_recordings_holds_in_each(shared):
-    z = shared.encode({"gain": 2.0, "offset": 0.25})
-    np.testing.assert_allclose(shared.decode(z)["offset"], 0.25, atol=1e-5)
-    nominal = {p.name: p.nominal for p in shared}
-    assert float(shared.of_recording(nominal, 2)["offset"]) == pytest.approx(0.1)
-    assert float(shared.of_recording(nominal, jnp.int32(1))["offset"]) == pytest.approx(0.1)
-
-
-def test_another_number_of_recordings(shared):
-    assert shared.for_recordings(1).names == ("gain", "offset@0")
-    np.testing.assert_allclose(shared.for_recordings(2).decode(np.zeros(3))["offset"], [0.0, 0.0], atol=1e-6)
 
 
 def test_fixed_parameters_leave_the_vector_and_stay_in_the_values(shared):
@@ -148,10 +119,10 @@ def test_fixed_parameters_leave_the_vector_and_stay_in_the_values(shared):
     values = fixed.decode(np.zeros(0))
     assert {n: np.asarray(v).tolist() for n, v in values.items()} == {
         "gain": 2.5,
-        "offset": pytest.approx([0.4] * 3),
+        "offset": pytest.approx(0.4),
         "mass": 7.0,
     }
-    assert float(shared.decode(np.zeros(4))["mass"]) == 7.0
+    assert float(shared.decode(np.zeros(2))["mass"]) == 7.0
     assert shared["gain"].free
     with pytest.raises(UsageError, match=r"unknown parameter 'gian'\. Available: gain, offset, mass"):
         shared.with_fixed({"gian": 1.0})
@@ -196,15 +167,6 @@ def test_a_prior_has_its_curvature_at_its_mode_too(name, off):
     h = 1e-3
     curvature = -(reference.logpdf(mode + h) - 2 * reference.logpdf(mode) + reference.logpdf(mode - h)) / h**2
     assert slope**2 == pytest.approx(curvature, rel=0.02)
-
-
-def test_priors_count_once_for_each_recording():
-    offset = Parameter("offset", "rad", 0.0, -1.0, 1.0, "linear", per_recording=True, prior=distrax.Normal(0.0, 0.1))
-    table = ParameterTable([offset], recordings=3)
-    z = table.encode({"offset": np.array([0.1, -0.2, 0.3])})
-    np.testing.assert_allclose(table.prior_residuals(jnp.asarray(z)), [1.0, -2.0, 3.0], rtol=1e-4)
-    fixed = table.with_fixed({"offset": 0.1})
-    assert fixed.prior_residuals(jnp.zeros(0)).shape == (0,)
 
 
 @pytest.mark.parametrize(

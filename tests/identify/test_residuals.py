@@ -9,7 +9,6 @@ from sim2real.artifacts.identification import Noise
 from sim2real.identification import predictions
 from sim2real.identification.problem import Problem
 from sim2real.identification.residuals import Groups, corrected, robust
-from sim2real.identification.rollouts import Program
 from sim2real.identification.segments import Span
 from sim2real.stages.deploy.replay import _of_noise
 
@@ -107,19 +106,10 @@ def test_what_is_left_out_counts_nowhere(problem):
 def test_programs_are_compiled_once_for_all_problems_of_a_model(problem):
     x = problem.table.encode(TRUE)
     problem.linearise(x)
-    compiled = {n: len(p._compiled) for n, p in problem.rollouts.programs.items()}
+    compiled = {n: p._cache_size() for n, p in problem.rollouts.programs.items()}
     other = problem.recut([Span(0, s.begin_s + 0.3, s.fitted) for s in SPANS[:-1]] + [SPANS[-1]], LENGTH_S)
     other.linearise(x, other.part(present=np.arange(4) < 2))
-    assert {n: len(p._compiled) for n, p in problem.rollouts.programs.items()} == compiled
-
-
-def test_a_program_is_compiled_for_each_form_and_says_so():
-    traced, told = [], []
-    program = Program(lambda x: traced.append(x.shape) or 2.0 * x)
-    for size in (3, 3, 4):
-        np.testing.assert_array_equal(program(np.ones(size, np.float32), on_compile=told.append), 2.0 * np.ones(size))
-    assert traced == [(3,), (4,)]
-    assert told == [True, False] * 2
+    assert {n: p._cache_size() for n, p in problem.rollouts.programs.items()} == compiled
 
 
 @pytest.mark.parametrize("fit_s", [LENGTH_S, SPLIT_S])

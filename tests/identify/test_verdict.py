@@ -199,3 +199,10 @@ def test_nothing_held_out_is_told():
 def test_extrapolation_is_said():
     found = judge(rows(0.1, 1.0), beyond=["held-out data extrapolates: kp"])
     assert "held-out data extrapolates: kp" in found.reasons
+
+
+def test_a_term_that_halves_the_error_comes_before_a_parameter_that_nothing_determines():
+    lacks = verdict.Lack(("direction lowers the error by 62%",), "--terms direction")
+    found = judge(rows(0.1, 1.0), check=check(("gain",)), lacks=lacks)
+    assert (found.status, found.next) == ("change the model", "--terms direction")
+    assert found.reasons[0] == "direction lowers the error by 62%"

@@ -126,11 +126,8 @@ def card_signals(
         kinds = {"computation": timing.steps_s, "bus": timing.bus_s, "transport": timing.transport_s}
         signals |= {f"times/{kind}/{node}": v for kind, rows in kinds.items() for node, v in rows.items() if v.size}
     # Without a model, without commands, or with too many of them there are no errors of a simulation.
-    several, why = [p.name for p in identification.parameters if "@" in p.name], ""
     if plain is None:
         why = "the robot's world has no counterpart in plain MuJoCo"
-    elif several:
-        why = f"{several[0].partition('@')[0]} differs from recording to recording, and a model has one value"
     elif not identification.replays:
         why = "the identification has no commands (replays.npz); identify again"
     else:

@@ -88,7 +88,7 @@ def find_terms(
         mjcf: Parameters by name -> the robot's model with them.
         sides: Delay -> ``command`` or ``measurement``.
     """
-    best = values_of(found)
+    best = found.values
     model = _mj.MjModel.from_xml_string(mjcf(best))
     numbers = _numbers(model)
     rows = [_numbers(_mj.MjModel.from_xml_string(mjcf({**best, **own}))) for own in _draws(found, draws)]
@@ -107,11 +107,6 @@ def find_terms(
     return Terms(
         joints, bodies, find_delays(found, sides), float(model.opt.timestep), tuple(_unexpressed(found, mjcf, best))
     )
-
-
-def values_of(found: Identification) -> dict[str, float]:
-    """Return the parameters by name; of one that each recording has its own of, that of the first."""
-    return {name.partition("@")[0]: value for name, value in reversed(found.values.items())}
 
 
 def find_delays(found: Identification, sides: Mapping[str, str]) -> Delays:
@@ -143,7 +138,7 @@ def _draws(found: Identification, count: int) -> list[dict[str, float]]:
     if found.posterior is None:
         return []
     drawn = found.posterior.sample(np.random.default_rng(0), count)
-    return [{n.partition("@")[0]: float(v[i]) for n, v in reversed(drawn.items())} for i in range(count)]
+    return [{n: float(v[i]) for n, v in drawn.items()} for i in range(count)]
 
 
 def _numbers(model: Any) -> dict[tuple[str, str, str], float]:
@@ -178,7 +173,7 @@ def _unexpressed(
     found: Identification, mjcf: Callable[[Mapping[str, float]], str], best: Mapping[str, float]
 ) -> list[str]:
     """Return the parameters without which the model would be the same, but for delays."""
-    names = {p.name.partition("@")[0]: p for p in found.parameters if p.kind not in ("delay", "derived")}
+    names = {p.name: p for p in found.parameters if p.kind not in ("delay", "derived")}
     # An optional term that is not part of the model sets no field.
     names = {name: p for name, p in names.items() if p.verdict != "fixed" or p.estimate != p.nominal}
     text = mjcf(best)

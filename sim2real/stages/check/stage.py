@@ -346,8 +346,7 @@ def _planned(
     from sim2real.stages.session.simulated_log import simulate  # JAX programs
 
     signal = robot.drive.around(played(config.record, robot))
-    table = parameters.for_recordings(1)
-    values = table.of_recording(table.decode(table.start()), 0)
+    values = parameters.decode(parameters.start())
     return simulate(model, robot, signal, values, fitting, config.record.seed)
 
 
@@ -465,8 +464,8 @@ def determine(
     errors = found.standard_error_per_minute.values()
     rows = [
         ParameterCheck(
-            *(c.label, c.parameter.unit, c.parameter.nominal, number(error)),
-            *("in a group" if c.label in grouped else "alone", c.parameter.excite),
+            *(c.name, c.unit, c.nominal, number(error)),
+            *("in a group" if c.name in grouped else "alone", c.excite),
         )
         for c, error in zip(problem.table.columns, errors, strict=True)
     ]

@@ -89,11 +89,9 @@ def _problem(
     """Return later logs in short segments, with the identified parameters, and the horizon of the predictions [s].
 
     Raises:
-        Sim2RealError: When the logs are too short or of another motion, or parameters differ between recordings.
+        Sim2RealError: When the logs are too short or of another motion.
     """
     model = robot.watched(config.max_delay_s)
-    if separate := [p.name for p in model.parameters if p.free and p.per_recording]:
-        raise Sim2RealError(f"{', '.join(separate)} differ between recordings: a new log has no values for them")
     if isinstance(model, ChecksLogs):
         for episode in episodes:
             model.check(episode)

@@ -75,7 +75,7 @@ def fit_model(inputs: Inputs, best: Best) -> Fits:
     # Fit the model with all terms that the configuration allows; terms are selected on windows, which takes less time.
     auto = config.terms == "auto"
     wide = replace(config, long_s=0.0) if auto else config
-    best.restart(table.for_recordings(len(inputs.episodes)))
+    best.restart(table)
     with _progress("identify", best) as report:
         widest = patiently(lambda: fitted_to(*data, wide, table, report, on_begin, as_start=auto))
     if not auto:
@@ -89,10 +89,8 @@ def fit_model(inputs: Inputs, best: Best) -> Fits:
     # the parameters of all other terms have their values without the term.
     narrow = table.with_terms(terms).with_fixed(config.fix)
     values = as_numbers(widest.problem.table, selection.chosen.x)
-    narrow = narrow.with_begin(
-        {p.name: float(np.squeeze(values[p.name])) for p in narrow if p.free and not p.per_recording}
-    )
-    best.restart(narrow.for_recordings(len(inputs.episodes)))
+    narrow = narrow.with_begin({p.name: values[p.name] for p in narrow if p.free})
+    best.restart(narrow)
     with _progress(f"identify with {', '.join(terms) or 'no term'}", best) as report:
         estimate = patiently(lambda: fitted_to(*data, replace(config, generations=0), narrow, report, best.begin))
     return Fits(widest, estimate, selection)
@@ -107,13 +105,13 @@ def determined(inputs: Inputs, fits: Fits, check: Determined, spread: Uncertaint
     estimate, groups, sentences = fits.estimate, check.undetermined, list[str]()
     table, tried, data = estimate.problem.table, set[str](), (inputs.model, inputs.episodes, inputs.fitted)
     absent = [n for n, verdict in zip(table.names, spread.verdict, strict=True) if verdict in (ABSENT, NOT_REACHED)]
-    config, able = inputs.config, {p.name for p in table if p.kind == "dynamics" and not (p.term or p.per_recording)}
+    config, able = inputs.config, {p.name for p in table if p.kind == "dynamics" and not p.term}
     while names := [n for group in groups for n in group if n in able - tried]:
         # Begin with parameters that a model may be without, such as an inertia of the rotor.
         name = min(names, key=lambda n: not table[n].vanishes)
         tried.add(name)
         held = estimate.problem.table.with_fixed({name: table[name].nominal})
-        end = estimate.x[[c.parameter.name != name for c in estimate.problem.table.columns]]
+        end = estimate.x[[c.name != name for c in estimate.problem.table.columns]]
         again = fitted_to(*data, inputs.windows, config, held, end=end)
         if not again.converged or again.loss > (1.0 + _AS_GOOD) * estimate.loss:
             continue
@@ -199,10 +197,8 @@ def widened(spread: Uncertainty, table: ParameterTable, at: Linearised, rows: Se
     """Return an uncertainty that includes the spread of the estimates without one part."""
     if len(rows) < _LEAST_PARTS:
         return spread
-    values = [[np.ravel(row.values[c.parameter.name])[c.recording or 0] for c in table.columns] for row in rows]
-    moved = np.array(
-        [[c.parameter.to_scale(v) for c, v in zip(table.columns, estimates, strict=True)] for estimates in values]
-    )
+    values = [[row.values[c.name] for c in table.columns] for row in rows]
+    moved = np.array([[c.to_scale(v) for c, v in zip(table.columns, estimates, strict=True)] for estimates in values])
     share = np.array([[row.share.get(name, 0.0) for name in table.names] for row in rows])
     if len(rows) > MOST:  # parts that were held out together have one estimate
         moved, of = np.unique(moved, axis=0, return_inverse=True)

@@ -30,7 +30,7 @@ from sim2real.identification import predictions as prediction
 from sim2real.identification import verdict
 from sim2real.identification.delays import links
 from sim2real.identification.expected import wider_for, with_expected_errors
-from sim2real.identification.fit import Fit, Value, as_numbers, refine, refit
+from sim2real.identification.fit import Fit, as_numbers, refine, refit
 from sim2real.identification.model import IdentifiableModel, measured_channels
 from sim2real.identification.parameters import ParameterTable
 from sim2real.identification.predictions import Position, positions, replays, worst_second
@@ -216,18 +216,16 @@ def _rows(findings: Findings, truth: Mapping[str, float]) -> list[Estimate]:
     # How the delay is shared between both sides of the world is a convention: only the sum has a true value.
     own_truth = lambda p: None if p.kind == "delay" and ROUND_TRIP in truth else truth.get(p.name)  # noqa: E731
     rows = []
-    for i, column in enumerate(parameters.columns):
-        p = column.parameter
-        value = np.ravel(findings.fit.values[p.name])[column.recording or 0]
+    for i, p in enumerate(parameters.columns):
         upper = bool(parameters.high[i] - findings.x[i] < findings.x[i] - parameters.low[i])
         rows.append(
             Estimate(
-                name=column.label,
+                name=p.name,
                 unit=p.unit,
                 kind=p.kind,
                 about=p.about,
                 nominal=p.nominal,
-                estimate=float(value),
+                estimate=findings.fit.values[p.name],
                 standard_error=float(spread.standard_error[i]),
                 low95=float(spread.low[i]),
                 high95=float(spread.high[i]),
@@ -255,7 +253,7 @@ def round_trip(rows: Sequence[Estimate], truth: Mapping[str, float]) -> list[Est
     """Return the row of the sum of all delays, of which one is identified: at most one row."""
     delays = [row for row in rows if row.kind == "delay"]
     free = [row for row in delays if row.verdict != "fixed"]
-    if len(free) != 1 or "@" in free[0].name:
+    if len(free) != 1:
         return []
     held = sum(row.estimate for row in delays if row.verdict == "fixed")
     moved = {n: getattr(free[0], n) for n in ("estimate", "low95", "high95", "lower", "upper")}
@@ -269,7 +267,7 @@ def _predicted(document: Identification, inputs: Inputs, fit: Fit) -> Identifica
     """Return the document with the columns of all segments and of the free runs, and their errors."""
     config, problem = inputs.config, fit.windows
     nominal = {p.name: p.nominal for p in inputs.model.parameters}
-    models: dict[str, Mapping[str, Value]] = {"identified": fit.values, **_without_delays(fit), "nominal": nominal}
+    models: dict[str, Mapping[str, float]] = {"identified": fit.values, **_without_delays(fit), "nominal": nominal}
     samples = prediction.samples(problem, models, config.settle_s)
     horizons = [round(share * config.horizon_s, 3) for share in _HORIZONS]
     runs, columns, long = free_runs(fit, inputs.episodes, inputs.fitted, config, models)
@@ -286,10 +284,10 @@ def _predicted(document: Identification, inputs: Inputs, fit: Fit) -> Identifica
     )
 
 
-def _without_delays(fit: Fit) -> dict[str, Mapping[str, Value]]:
+def _without_delays(fit: Fit) -> dict[str, Mapping[str, float]]:
     """Return the baseline: the same model fitted without delays, if it has some."""
     table = fit.problem.table
-    kept = np.array([c.parameter.kind != "delay" for c in table.columns])
+    kept = np.array([c.kind != "delay" for c in table.columns])
     if kept.all():
         return {}
     delays = [p for p in table if p.free and p.kind == "delay"]
@@ -423,7 +421,7 @@ def inclined(inputs: Inputs, fit: Fit) -> tuple[float, dict[str, float], str] | 
     length_s = config.settle_s + config.horizon_s
     problem = few_of(Problem(model, inputs.episodes, inputs.windows, length_s, config, table))
     estimate = problem.table.encode({p.name: p.without for p in problem.table} | fit.values)
-    columns = np.array([c.parameter.name in turns for c in problem.table.columns])
+    columns = np.array([c.name in turns for c in problem.table.columns])
     starts = []
     for x in (estimate, problem.table.start()):
         candidates = np.repeat(x[None], 1 + len(_TURNS) * int(columns.sum()), axis=0)

@@ -106,23 +106,22 @@ class Best:
         """Write the best values as an identification with the verdict ``not finished``, without intervals."""
         if self.folder is None or self.inputs is None or self.z is None:
             return
-        values = {name: np.ravel(value) for name, value in as_numbers(self.table, self.z).items()}
+        values = as_numbers(self.table, self.z)
         done = ", ".join(f"{share:.0%} of {what}" for what, share in self.done.items())
         reason = f"it ended after {done}: these values have no intervals and were not judged on held-out data"
         rows = [
             Estimate(
-                name=f"{p.name}@{i}" if p.per_recording else p.name,
+                name=p.name,
                 unit=p.unit,
                 kind=p.kind,
                 about=p.about,
                 nominal=p.nominal,
-                estimate=float(value),
+                estimate=values[p.name],
                 lower=p.low,
                 upper=p.high,
                 verdict="not determined" if p.free else "fixed",
             )
             for p in self.table
-            for i, value in enumerate(values[p.name])
         ]
         Identification(
             pipeline=self.inputs.loaded.name,

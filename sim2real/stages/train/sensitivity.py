@@ -13,7 +13,7 @@ from sim2real.artifacts.posterior import TRANSFORMS, Posterior, from_scale
 from sim2real.artifacts.sensitivity import Moved, Sensitivity
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import UsageError
-from sim2real.identification.rollouts import Program
+from sim2real.identification.rollouts import jitted
 from sim2real.robots.loop import DELAYS, LoopTask, split_delay
 from sim2real.robots.robot import Robot
 from sim2real.stages.train.config import TrainConfig
@@ -178,7 +178,7 @@ def sensitivity(
         return evaluate(environment, config, policy, key)["success"]
 
     # The first model has the estimates; the others are those of the moves, in order.
-    success = np.asarray(Program(jax.vmap(play))(columns), np.float64)
+    success = np.asarray(jitted(jax.vmap(play))(columns), np.float64)
     by_move = zip(moves, success[1:].reshape(len(moves), len(MULTIPLES)), strict=True)
     moved = [Moved(m.name, m.unit, m.estimate, m.half_width, m.values, s) for m, s in by_move]
     return Sensitivity.of(MULTIPLES, float(success[0]), _EPISODES, moved)

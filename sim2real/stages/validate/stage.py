@@ -211,7 +211,7 @@ def score(
         refused: Log -> why it was not read.
 
     Raises:
-        UsageError: A log was fitted, no log can be scored, or each recording has its own parameters.
+        UsageError: A log was fitted, no log can be scored parameters.
     """
     robot, fitting = identified_robot(identification, robot)
     model = measured_channels(robot.identifiable(fitting.max_delay_s), [log.episode for log in logs])
@@ -273,10 +273,8 @@ def models_of(identification: Identification, model: IdentifiableModel) -> dict[
     """Return the values of the models that predict: identified and nominal.
 
     Raises:
-        UsageError: The identification lacks parameters of the model, or each recording has its own.
+        UsageError: The identification lacks parameters of the model.
     """
-    if varying := [p.name for p in model.parameters if p.free and p.per_recording]:
-        raise UsageError(f"{', '.join(varying)} differ from recording to recording: a new log has no estimates of them")
     estimates = {p.name: p.estimate for p in identification.parameters}
     if lacking := [p.name for p in model.parameters if p.name not in estimates]:
         raise UsageError(f"the parameters lack {', '.join(lacking)}", hint="they are of another state of the robot")
