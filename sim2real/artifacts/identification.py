@@ -46,7 +46,7 @@ class Estimate:
     """One identified parameter; a number is None if it does not apply, is infinite or unknown.
 
     Attributes:
-        name: Its name; ``NAME@RECORDING`` if each recording has a value of its own.
+        name: Its name.
         kind: Kind of the parameter; a ``derived`` one is computed from others.
         nominal: The data sheet's value.
         low95: Lower end of the 95 % interval.

@@ -112,6 +112,13 @@ def test_programs_are_compiled_once_for_all_problems_of_a_model(problem):
     assert {n: p._cache_size() for n, p in problem.rollouts.programs.items()} == compiled
 
 
+def test_each_run_is_compared_up_to_its_own_end(problem):
+    runs = problem.recut([Span(0, 0.4, False), Span(0, 3.0, False)], LENGTH_S, ends_s=[0.5, LENGTH_S])
+    last = runs.ts.max(axis=1)
+    assert last[0] == pytest.approx(0.5, abs=PERIOD_S)
+    assert last[1] == pytest.approx(LENGTH_S, abs=PERIOD_S)
+
+
 @pytest.mark.parametrize("fit_s", [LENGTH_S, SPLIT_S])
 def test_an_initial_state_is_that_of_least_squares(problem, fit_s):
     """A lag is linear in it: numpy solves for it at once, with a prior around the estimate."""

@@ -53,6 +53,13 @@ def test_a_linear_model_with_white_noise_has_the_textbooks_covariance():
     assert found.verdict == ("ok",) * 3
 
 
+def test_a_residual_that_is_exactly_zero_counts():
+    r, everywhere = np.random.default_rng(3).normal(size=(10, 40, 1)), np.ones((10, 40), bool)
+    resting = np.where(np.arange(10)[:, None, None] < 5, r, 0.0)
+    whole, half = uncertainty.deviation(resting, everywhere), uncertainty.deviation(resting[:5], everywhere[:5])
+    assert whole == pytest.approx(half / np.sqrt(2.0), rel=1e-6)
+
+
 def test_measurements_that_are_masked_do_not_count():
     rng = np.random.default_rng(1)
     X, noise = np.ones((1, 40, 1, 1)), rng.normal(size=(1, 40, 1))

@@ -1,11 +1,12 @@
 """What a model lacks: residuals far above the noise and free runs that are far off, and the term that mends them."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from sim2real.artifacts.identification import FreeRun, Identification, Judgement, Noise, TriedTerm
+from sim2real.artifacts.identification import Estimate, FreeRun, Identification, Judgement, Noise, TriedTerm
 from sim2real.identification.held_out import Refits
 from sim2real.identification.verdict import Position
 from sim2real.stages.identify import judgement
@@ -119,3 +120,10 @@ def test_positions_are_compared_by_their_own_noise_and_range():
     assert largest_residual(found, (Noise("x[1]", "rad", 0.0, 0.0, 0.0),), [ARM])[2] == pytest.approx(1e-4)
     assert largest_residual(found, (), [ARM]) is None
     assert farthest_run(found, [AXIS, ARM]) == (AXIS, 0.05, pytest.approx(0.25))
+
+
+def test_no_parameter_is_ok_in_a_fit_that_is_not_accepted():
+    row = Estimate("kp", "1", "dynamics", "", 1.0, 1.0, verdict="ok")
+    assert judgement._doubted(row).verdict == "not determined"
+    for state in ("at a bound", "fixed"):
+        assert judgement._doubted(replace(row, verdict=state)).verdict == state

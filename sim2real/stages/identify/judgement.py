@@ -249,6 +249,11 @@ def _without_interval(row: Estimate) -> Estimate:
     return replace(row, standard_error=None, low95=None, high95=None, verdict="not determined")
 
 
+def _doubted(row: Estimate) -> Estimate:
+    """Return the row of a parameter of a fit that is not accepted, in which none is ok."""
+    return replace(row, verdict="not determined") if row.verdict == "ok" else row
+
+
 def round_trip(rows: Sequence[Estimate], truth: Mapping[str, float]) -> list[Estimate]:
     """Return the row of the sum of all delays, of which one is identified: at most one row."""
     delays = [row for row in rows if row.kind == "delay"]
@@ -550,11 +555,7 @@ def _judged(
     if worst is not None and worst.unexplained:
         where = f"the model does not explain {worst.name} in the second from {worst.begin_s:.1f} s on: {worst.error}"
         reasons.append(f"{where}; look at the log there")
-    # In a fit that is not accepted no parameter is ok.
-    parameters = document.parameters
-    if status != ACCEPTED:
-        doubted = {"ok": "not determined"}
-        parameters = tuple(replace(p, verdict=doubted.get(p.verdict, p.verdict)) for p in parameters)
+    parameters = document.parameters if status == ACCEPTED else tuple(map(_doubted, document.parameters))
     judgement = Judgement(status, tuple(reasons), flags)
     return replace(document, verdict=judgement, parameters=parameters, held_out=tuple(rows), worst=worst)
 
