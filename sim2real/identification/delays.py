@@ -283,7 +283,7 @@ def _arrived(linearise: Linearise, x: np.ndarray, delay_s: float) -> Delays:
     """
     # First estimates by least squares; a step that does not lower the errors is taken in part.
     evidence = linearise(x, delay_s)
-    ones = np.ones(evidence.errors.shape[1])
+    ones, first = np.ones(evidence.errors.shape[1]), (_maximum(evidence, delay_s), x)
     for _ in range(_ROUNDS):
         move, _, least = _straight(evidence, delay_s, _FIRST_S, ones)
         for part in _PARTS:
@@ -301,10 +301,9 @@ def _arrived(linearise: Linearise, x: np.ndarray, delay_s: float) -> Delays:
     best, step = 0, 1 if local(1)[0] > local(-1)[0] else -1
     while abs(best) < _TRIES and local(best + step)[0] > local(best)[0]:
         best += step
-    # Linearise twice more, at the best of these and near the first delay: far steps may have looked too good.
+    # Linearise twice more, at the best of these and near the caller's estimate: far steps may have looked too good.
     ends = []
-    for start in {0, best}:
-        (_, likelihood, p), at = local(start), x
+    for (_, likelihood, p), at in (first, (local(best), x)):
         for _ in range(_AGAIN):
             at, noise, share = at + p[: len(x)], likelihood.noise(p), likelihood.shares(p)
             likelihood = Likelihood(linearise(at, float(share @ likelihood.grid)), likelihood.grid)
