@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -26,7 +26,7 @@ from sim2real.identification import predictions as prediction
 from sim2real.identification.expected import wider_for
 from sim2real.identification.held_out import moving
 from sim2real.identification.model import IdentifiableModel, measured_channels
-from sim2real.identification.predictions import Position, positions
+from sim2real.identification.predictions import positions
 from sim2real.identification.problem import Problem
 from sim2real.identification.segments import Span, check_log, ranges
 from sim2real.identification.verdict import ACCEPTED, scores
@@ -235,29 +235,32 @@ def score(
         raise UsageError("; ".join(f"{path}: {reason}" for path, reason in refused.items()) or "no log was given")
 
     # Predict windows of the horizon, and a free run of each log; a short log has shorter ones.
-    expected = {(e.column, e.kind): e for e in identification.expected_error}
+    limits = {(e.column, e.kind): e for e in identification.expected_error}
     horizon_s = config.horizon_s or next((row.seconds for row in identification.held_out), fitting.horizon_s)
-    run_s = config.free_run_s or max((b.seconds for k, b in expected.items() if k[1] == FREE_RUN), default=_FREE_RUN_S)
+    run_s = config.free_run_s or max((e.seconds for k, e in limits.items() if k[1] == FREE_RUN), default=_FREE_RUN_S)
     errors, measured = list[ComparedError](), positions(model, robot.units)
     kinds: tuple[tuple[ErrorKind, float], ...] = ((AHEAD, horizon_s), (FREE_RUN, run_s))
     with progress(None, "validate: simulate"):
+        windows = None
         for kind, most_s in kinds:
             values = models if kind == AHEAD else {"identified": models["identified"]}
-            for seconds in sorted({min(most_s, length) for length in lengths}):
-                those = [r for r, length in enumerate(lengths) if min(most_s, length) == seconds]
-                windows = _segments(model, good, those, fitting, seconds, kind)
-                columns = prediction.samples(windows, values, fitting.settle_s)
-                for r in those:
-                    spans = [s for s in windows.spans if s.recording == r]
-                    seen = ranges(model, [log.episode for log in good], spans, windows.segment_s)
-                    wider = wider_for(identification.ranges, seen, measured)
-                    for row in _errors_on(windows, columns, r, list(values), measured, fitting.settle_s, seconds):
-                        limit, factor = expected.get((row.column, kind)), wider.get(row.column, 1.0)
-                        limited = replace(row, kind=kind, wider=factor, source=good[r].path.name, seconds=seconds)
-                        if limit is not None:
-                            limited = replace(limited, expected=factor * limit.error)
-                        ahead = kind == AHEAD
-                        errors.append(limited if ahead else replace(limited, beaten_by=(), baselines={}))
+            seconds = [min(most_s, length) for length in lengths]
+            windows = _windows(model, good, seconds, fitting, kind, windows)
+            columns = prediction.samples(windows, values, fitting.settle_s)
+            for r, log in enumerate(good):
+                spans = [span for span in windows.spans if span.recording == r]
+                seen = ranges(model, [log.episode for log in good], spans, fitting.settle_s + seconds[r])
+                wider = wider_for(identification.ranges, seen, measured)
+                moves = moving(windows, np.flatnonzero(windows.recording == r))
+                moves = dict(zip(prediction.labels(windows), moves, strict=True))
+                of_log = {name: column[columns["recording"] == r] for name, column in columns.items()}
+                rows = prediction.errors(windows, of_log, list(values), fitting.settle_s, [seconds[r]])
+                for row in (row for row in scores(rows, measured) if moves[row.column]):
+                    limit, factor = limits.get((row.column, kind)), wider.get(row.column, 1.0)
+                    found = replace(row, source=log.path.name, kind=kind, seconds=seconds[r], wider=factor)
+                    if limit is not None:
+                        found = replace(found, expected=factor * limit.error)
+                    errors.append(found if kind == AHEAD else replace(found, beaten_by=(), baselines={}))
     # A joint that rests is not compared: "no motion" would always be best.
     moved = {(e.source, e.column) for e in errors if e.kind == AHEAD}
     resting = {log.path.name: [p.name for p in measured if (log.path.name, p.column) not in moved] for log in good}
@@ -284,34 +287,25 @@ def models_of(identification: Identification, model: IdentifiableModel) -> dict[
     }
 
 
-def _segments(
+def _windows(
     model: IdentifiableModel,
     logs: Sequence[Recording],
-    those: Sequence[int],
+    seconds: Sequence[float],
     config: IdentifyConfig,
-    seconds: float,
     kind: ErrorKind,
+    like: Problem | None,
 ) -> Problem:
-    """Return some logs in segments without a fitted one; a free run is one segment a log."""
-    length_s, spans = config.settle_s + seconds, []
-    for r in those:
-        begins = side_by_side(logs[r].episode, config, length_s)
-        spans += [Span(r, begin, False) for begin in (begins[:1] if kind == FREE_RUN else begins)]
-    return Problem(model, [log.episode for log in logs], spans, length_s, config)
+    """Return logs in segments without a fitted one; a free run is one segment a log.
 
-
-def _errors_on(
-    windows: Problem,
-    columns: Mapping[str, np.ndarray],
-    recording: int,
-    models: Sequence[str],
-    measured: Sequence[Position],
-    settle_s: float,
-    seconds: float,
-) -> Iterator[ComparedError]:
-    """Yield the errors of the joints that move in one log."""
-    segments = np.flatnonzero(windows.recording == recording)
-    moves = dict(zip(prediction.labels(windows), moving(windows, segments), strict=True))
-    of_log = {name: values[columns["recording"] == recording] for name, values in columns.items()}
-    rows = scores(prediction.errors(windows, of_log, list(models), settle_s, [seconds]), measured)
-    return (row for row in rows if moves[row.column])
+    Args:
+        seconds: Length of the predictions of each log [s].
+        like: Another problem of these logs; both share programs.
+    """
+    spans, ends_s = list[Span](), list[float]()
+    for r, (log, own_s) in enumerate(zip(logs, seconds, strict=True)):
+        begins = side_by_side(log.episode, config, config.settle_s + own_s)
+        begins = begins[:1] if kind == FREE_RUN else begins
+        spans += [Span(r, begin, False) for begin in begins]
+        ends_s += [config.settle_s + own_s] * len(begins)
+    like = like or Problem(model, [log.episode for log in logs], spans, max(ends_s), config)
+    return like.recut(spans, max(ends_s), ends_s=ends_s)
