@@ -43,6 +43,14 @@ def test_of_each_group_of_steps_the_latest_is_shown():
     assert np.count_nonzero(lateness["agent"] > 2.0) == 3
 
 
+@pytest.mark.parametrize("rate_hz", [30, 50, 60, 74, 100, 120, 500])
+def test_no_rate_gives_more_than_fifty_rows_a_second(rate_hz):
+    at = np.round(1e6 * np.arange(10 * rate_hz) / rate_hz).astype(np.int64)
+    steps = Steps(at, at, at, np.full(len(at), -1), at + 100, np.zeros(len(at), np.int64))
+    episode = Episode({"agent": steps}, {}, {}, {"graph": {"agent": {"rate_hz": float(rate_hz)}}})
+    assert len(_thinned(episode)[0].steps["agent"]) <= 500
+
+
 def test_a_goal_stands_beside_the_position_of_its_joint(tmp_path, monkeypatch):
     at = 1_000 * np.arange(4)
     steps = Steps(at, at, at, np.full(4, -1), at + 100, np.zeros(4, np.int64))

@@ -1,5 +1,6 @@
 """A growing log as a live view shows it: at most 50 rows a second, and of each group of steps the latest one."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -51,7 +52,7 @@ def _thinned(episode: Episode) -> tuple[Episode, dict[str, np.ndarray]]:
     steps, outputs, lateness = {}, {}, {}
     for node, every in episode.steps.items():
         rate_hz = float(episode.metadata.get("graph", {}).get(node, {}).get("rate_hz", ROWS_PER_S))
-        size, late = max(1, round(rate_hz / ROWS_PER_S)), (every.woken - every.start) / 1e3
+        size, late = max(1, math.ceil(rate_hz / ROWS_PER_S - 1e-6)), (every.woken - every.start) / 1e3
         rows = np.array([i + int(late[i : i + size].argmax()) for i in range(0, len(every), size)], np.int64)
         steps[node] = Steps(*(getattr(every, name)[rows] for name in Steps.__dataclass_fields__))
         outputs[node] = {name: values[rows] for name, values in episode.outputs.get(node, {}).items()}
