@@ -28,6 +28,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "info": ("about the installation, a pipeline, a log or a run", "info.info"),
     "check": ("predict which parameters a recording, or a planned one, can determine", "stages.check"),
     "validate": ("score an identification on later logs", "stages.validate"),
+    "doctor": ("why a policy works in simulation and fails on the robot", "doctor.doctor"),
     "import": ("convert files of other recorders into logs", "stages.import_files"),
     "new": ("write the files of a pipeline for a robot that has a model", "new.new"),
     "export": ("the estimates for MuJoCo, mjlab, Isaac Lab or as JSON; or a policy for numpy alone", "export.export_"),

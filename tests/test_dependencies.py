@@ -16,7 +16,7 @@ EXTRAS = {name: packages for name, packages in PROJECT["optional-dependencies"].
 IMPORTED_AS = {
     "mcap-ros2-support": "mcap_ros2",
     "dm-control": "dm_control", "dm-env": "dm_env", "dynamixel-sdk": "dynamixel_sdk", "mujoco-mjx": "mujoco.mjx",
-    "pyserial": "serial", "rerun-sdk": "rerun", "scikit-learn": "sklearn",
+    "pyserial": "serial", "pyyaml": "yaml", "rerun-sdk": "rerun", "scikit-learn": "sklearn",
 }  # fmt: skip
 MAY_IMPORT = {
     "view": {"sim2real.view.rerun_recording", "sim2real.view.rerun_viewer", "sim2real.view.model_scene"},

@@ -32,6 +32,7 @@ _SHOWN: Mapping[str, str] = {
     "DeployConfig": "port bundle episodes duration_s command dry_run force seed view",
     "NewConfig": "name robot log drive like port",
     "RobotFlags": "mjcf joints parameter mapping unit rate_hz",
+    "DoctorConfig": "policy log mjcf contract sim out bundle json",
     "CheckConfig": "log plan bounds fix json runs",
     "ValidateConfig": "parameters log force json",
     "ImportConfig": "files mapping pipeline mjcf joints unit calibration rate_hz out",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -109,6 +109,29 @@ def _gru_step(gru: Mapping[str, np.ndarray], carry: np.ndarray, x: np.ndarray) -
     return (1.0 - update) * np.tanh(of_input[2] + reset * of_state[2]) + update * carry
 
 
+def onnx_session(model: bytes) -> Any:
+    """Return onnxruntime's session of a model, on one thread: the policy is small, and the control loop has one core.
+
+    Raises:
+        UsageError: onnxruntime is not installed.
+        Sim2RealError: onnxruntime cannot load the model.
+    """
+    try:
+        import onnxruntime
+    except ImportError as error:
+        raise UsageError(
+            "backend 'onnx' needs onnxruntime, which is not installed",
+            hint=f"{with_extra('hardware')}, or use backend 'numpy'",
+        ) from error
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 3
+    try:
+        return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # its errors share no public base class
+        raise Sim2RealError(f"onnxruntime cannot load the policy: {error}") from error
+
+
 class OnnxBackend:
     """The network in onnxruntime, on one thread, as more threads only add jitter for networks of this size.
 
@@ -121,20 +144,7 @@ class OnnxBackend:
     """
 
     def __init__(self, model: bytes) -> None:
-        try:
-            import onnxruntime
-        except ImportError as error:
-            raise UsageError(
-                "backend 'onnx' needs onnxruntime, which is not installed",
-                hint=f"{with_extra('hardware')}, or use backend 'numpy'",
-            ) from error
-        # One thread: the policy is small, and the control loop has one core.
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        try:
-            self._session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # its errors share no public base class
-            raise Sim2RealError(f"onnxruntime cannot load the policy: {error}") from error
+        self._session = onnx_session(model)
         metadata = self._session.get_modelmeta().custom_metadata_map
         first = json.loads(metadata.get(INITIAL_CARRY, "[]"))
         self._first = {f"carry_{i}": np.array(value, np.float32)[None] for i, value in enumerate(first)}

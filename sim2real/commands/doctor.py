@@ -1,0 +1,88 @@
+"""``sim2real doctor``: why a policy works in simulation and fails on the robot."""
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from sim2real.commands import flags
+from sim2real.commands.stages import examples_of, summary_of
+from sim2real.errors import ERROR, UsageError
+from sim2real.stages.flag import Flag
+from sim2real.stages.terminal.console import note, wrote
+
+
+@dataclass(frozen=True)
+class DoctorConfig:
+    """Say why a policy works in simulation and fails on the robot; without --log: what may fail before it moves."""
+
+    policy: Annotated[Path | None, Flag("FILE")] = None
+    """The policy: an ONNX file of any trainer, or the folder of a bundle."""
+    log: Annotated[Path | None, Flag("FILE")] = None
+    """Log of the deployment: of this project, or CSV, NPZ, JSON or a bag with a row for each step of the policy."""
+    mjcf: Annotated[Path | None, Flag("ROBOT.xml")] = None
+    """The model that the policy was trained on."""
+    contract: Annotated[Path | None, Flag("FILE")] = None
+    """What the policy expects: contract.toml, Unitree's deploy.yaml, or Isaac Lab's env.yaml."""
+    sim: Annotated[Path | None, Flag("FILE")] = None
+    """Log of the same policy in simulation, whose times count as those of the training."""
+    out: Path = Path("doctor")
+    """Folder of the page, and of a contract file with questions."""
+    bundle: Annotated[Path | None, Flag("FOLDER")] = None
+    """Write the policy as a bundle, which deploy and other tools take."""
+    json: bool = False
+    """Print the diagnosis as JSON."""
+
+
+def doctor(command: str, arguments: list[str]) -> None:
+    """``sim2real doctor --policy POLICY.onnx --log LOG --mjcf ROBOT.xml [--contract FILE]``."""
+    examples = examples_of(
+        "doctor --policy policy.onnx --log real.mcap --mjcf robot.xml", "doctor --policy policy.onnx --mjcf robot.xml"
+    )
+    config = flags.parse(DoctorConfig(), arguments, f"sim2real {command}", summary_of(DoctorConfig()), examples)
+    data, sentence, wrong = run(config)
+    print(json.dumps(data, indent=2, default=float) if config.json else sentence)
+    if wrong:
+        sys.exit(ERROR)
+
+
+def run(config: DoctorConfig) -> tuple[dict[str, Any], str, bool]:
+    """Return the diagnosis as data, its text, and whether something is wrong; write the page.
+
+    Raises:
+        UsageError: A file is missing or wrong, or the contract has open questions.
+    """
+    from sim2real.doctor.contract import read_policy, write_bundle
+    from sim2real.doctor.plant import Drives, driven_joints
+
+    if config.policy is None or (config.log is None and config.mjcf is None and config.bundle is None):
+        raise UsageError("doctor needs --policy, and --log of the robot or --mjcf of the model, or both")
+    config.out.mkdir(parents=True, exist_ok=True)
+    joints = tuple(driven_joints(config.mjcf)) if config.mjcf else ()
+    policy = read_policy(config.policy, config.contract, joints, config.out)
+    if config.bundle is not None:
+        wrote(write_bundle(config.bundle, policy))
+        if config.log is None and config.mjcf is None:
+            return {"bundle": str(config.bundle)}, f"{config.bundle} is a bundle", False
+    drives = Drives(config.mjcf, policy.contract) if config.mjcf else None
+    if config.log is None:
+        from sim2real.doctor.before import examine
+
+        assert drives is not None
+        data = examine(policy, drives)
+        return data, "\n".join([data["sentence"], *(f"- {line}" for line in data["lines"])]), not data["sound"]
+
+    from sim2real.doctor.diagnosis import diagnose
+    from sim2real.doctor.log import read_deployment
+    from sim2real.doctor.report import write_diagnosis
+
+    wanted = policy.contract.joints
+    log = read_deployment(config.log, wanted, len(wanted), joints)
+    sim = None if config.sim is None else read_deployment(config.sim, wanted, len(wanted), joints)
+    note(f"{len(log.t)} steps of the policy in {log.t[-1] - log.t[0]:.1f} s")
+    found = diagnose(policy, log, drives, sim, joints)
+    wrote(write_diagnosis(config.out, found, log, config.policy.stem))
+    lines = [found.sentence, *(f"- {f.question}: {f.text}; {f.share:.0%} of this gap" for f in found.findings),
+             *(f"- {question} was not asked: {why}" for question, why in found.skipped.items())]  # fmt: skip
+    return found.to_dict(), "\n".join(lines), bool(found.findings) or found.unexplained
