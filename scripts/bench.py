@@ -31,6 +31,7 @@ BENCHES = {
     "async": ("asynchronous", "the simulated clock's speed, and the wall clock's lateness"),
     "compose": ("compose", "control steps against dm_control, tasks on Warp against bare steps"),
     "demo": ("runs.demo", "the pendulum's whole run for several seeds"),
+    "doctor": ("doctor", "faults of deployments that the doctor names, on robots drawn at random"),
     "drift": ("drift", "how often the drift test detects and names a change of a hidden SO-101"),
     "faults": ("faults", "faults while a policy runs: time until the motor is safe, the log, exit code and message"),
     "graph": ("graph", "the compiled graph against a robot written by hand"),

@@ -62,7 +62,7 @@ def run(config: DoctorConfig) -> tuple[dict[str, Any], str, bool]:
     joints = tuple(driven_joints(config.mjcf)) if config.mjcf else ()
     policy = read_policy(config.policy, config.contract, joints, config.out)
     if config.bundle is not None:
-        wrote(write_bundle(config.bundle, policy))
+        (note if config.json else wrote)(str(write_bundle(config.bundle, policy)))
         if config.log is None and config.mjcf is None:
             return {"bundle": str(config.bundle)}, f"{config.bundle} is a bundle", False
     drives = Drives(config.mjcf, policy.contract) if config.mjcf else None
@@ -82,7 +82,8 @@ def run(config: DoctorConfig) -> tuple[dict[str, Any], str, bool]:
     sim = None if config.sim is None else read_deployment(config.sim, wanted, len(wanted), joints)
     note(f"{len(log.t)} steps of the policy in {log.t[-1] - log.t[0]:.1f} s")
     found = diagnose(policy, log, drives, sim, joints)
-    wrote(write_diagnosis(config.out, found, log, config.policy.stem))
+    page = write_diagnosis(config.out, found, log, config.policy.stem)
+    (note if config.json else wrote)(str(page))
     lines = [found.sentence, *(f"- {f.question}: {f.text}; {f.share:.0%} of this gap" for f in found.findings),
              *(f"- {question} was not asked: {why}" for question, why in found.skipped.items())]  # fmt: skip
-    return found.to_dict(), "\n".join(lines), bool(found.findings) or found.unexplained
+    return found.to_dict() | {"page": str(page)}, "\n".join(lines), bool(found.findings) or found.unexplained

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -89,7 +89,7 @@ def examine(policy: Policy, drives: Drives) -> dict[str, Any]:
 def _run(policy: Policy, drives: Drives, plant: Plant, start: np.random.Generator | None) -> Run:
     """Let the policy act in the model, with the command 0."""
     c, d = policy.contract, drives
-    model = d.with_plant(replace(plant, limit=1.0), np.full(len(c.joints), 1e6))
+    model = d.with_plant(plant, np.full(len(c.joints), 1e6))
     data = mujoco.MjData(model)
     default = c.per_joint("default_joint_pos")
     data.qpos[d.qpos] = default

@@ -11,6 +11,7 @@ from sim2real.doctor.log import Log
 from sim2real.doctor.plant import Drives, solve_plant
 from sim2real.doctor.solve import Finding, solve_contract
 from sim2real.doctor.timing import solve_timing
+from sim2real.errors import UsageError
 
 _UNEXPLAINED = 0.45
 """A replay whose error stays above this share of the joints' motion has a cause that no question names."""
@@ -79,9 +80,12 @@ def diagnose(policy: Policy, log: Log, drives: Drives | None = None, sim: Log | 
     elif log.target is None:
         skipped["plant"] = "the log has no targets"
     else:
-        trained = None if sim is None or sim.target is None else solve_plant(drives, sim, contract)[1]["delay_s"]
-        of_plant, figures["plant"] = solve_plant(drives, log, contract, trained)
-        findings += of_plant
+        try:
+            trained = None if sim is None or sim.target is None else solve_plant(drives, sim, contract)[1]["delay_s"]
+            of_plant, figures["plant"] = solve_plant(drives, log, contract, trained)
+            findings += of_plant
+        except UsageError as error:
+            skipped["plant"] = str(error.args[0])
     # One line for each fault and question.
     best: dict[tuple[str, str], Finding] = {}
     for finding in findings:

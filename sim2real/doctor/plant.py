@@ -22,6 +22,8 @@ _STEP_S, _WINDOW_S, _WINDOWS = 0.0025, 0.2, 40
 _LATER_S = 0.010
 """A delay that is longer by this than that of the training is a fault [s]; a training without a known delay had none,
 and the first 10 ms are those of any robot."""
+_UPRIGHT = 0.8
+"""Cosine of the tilt up to which a free robot stands."""
 _GAIN_BAND = (0.72, 1.4)
 _CLEAR = 1.08
 """A parameter is at fault if the replay's error grows by this factor with the model's value."""
@@ -34,15 +36,14 @@ class Plant:
     Attributes:
         delay_s: From a target in the log to the motion in the log [s].
         kp, kd, friction, armature: Factors beside the contract's gains and the model.
-        limit: Torque limit as a share of the largest torque that the targets ask for.
+        limits: Torque limit of each joint, a share of the largest torque that its targets ask for; empty: the model's.
         payload: Added mass of the heaviest body, as a share of the robot's.
-        offset: Shift of each joint's angle [rad].
     """
 
     delay_s: float = 0.0
     kp: float = 1.0
     kd: float = 1.0
-    limit: float = 1.0
+    limits: tuple[float, ...] = ()
     friction: float = 1.0
     armature: float = 1.0
     payload: float = 0.0
@@ -51,11 +52,11 @@ class Plant:
 mujoco: Any = mujoco_c  # its C module has no stubs
 GRIDS: dict[str, tuple[float, ...]] = {
     "delay_s": (0.0, 0.007, 0.014, 0.021, 0.028, 0.035, 0.045, 0.06),
-    "kp": (0.35, 0.5, 0.65, 0.8, 1.0, 1.25, 1.6, 2.2),
-    "limit": (0.12, 0.18, 0.25, 0.35, 0.5, 0.7),
+    "kp": (0.35, 0.5, 0.65, 0.8, 1.25, 1.6, 2.2),
     "friction": (0.2, 3.0, 6.0, 12.0),
     "payload": (-0.1, 0.1, 0.2, 0.4),
 }
+_LIMITS = (0.05, 0.08, 0.12, 0.17, 0.24, 0.33, 0.45, 0.6)
 _NOMINAL = Plant()
 
 
@@ -63,9 +64,8 @@ def driven_joints(mjcf: Path) -> list[str]:
     """Return the joints of a model that drives turn, in the order of its actuators, or of its joints without any."""
     model = read_model(mjcf)
     of_actuators = [int(model.actuator_trnid[i, 0]) for i in range(model.nu)]
-    single = [
-        i for i in range(model.njnt) if model.jnt_type[i] in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-    ]
+    turning = [int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)]
+    single = [i for i in range(model.njnt) if int(model.jnt_type[i]) in turning]
     return [model.joint(i).name for i in of_actuators or single]
 
 
@@ -130,7 +130,7 @@ class Drives:
         self.model = spec.compile()
         self.qpos = np.array([self.model.joint(j).qposadr[0] for j in contract.joints])
         self.dof = np.array([self.model.joint(j).dofadr[0] for j in contract.joints])
-        self.free = self.model.njnt > 0 and self.model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE
+        self.free = self.model.njnt > 0 and int(self.model.jnt_type[0]) == int(mujoco.mjtJoint.mjJNT_FREE)
         # The body that a payload adds to: the heaviest of a free robot, the outermost of a fixed one.
         moved = self.model.jnt_bodyid[[self.model.joint(j).id for j in contract.joints]]
         self.loaded = int(np.argmax(self.model.body_mass)) if self.free else int(moved[-1])
@@ -141,7 +141,7 @@ class Drives:
         model.actuator_gainprm[:, 0] = self.kp * plant.kp
         if not self.torque_driven:
             model.actuator_biasprm[:, 1], model.actuator_biasprm[:, 2] = -self.kp * plant.kp, -self.kd * plant.kd
-        limit = np.minimum(self.limit, asked * plant.limit if plant.limit < 1.0 else np.inf)
+        limit = np.minimum(self.limit, asked * plant.limits if plant.limits else np.inf)
         model.actuator_forcerange[:, 0], model.actuator_forcerange[:, 1] = -limit, limit
         model.dof_frictionloss[self.dof] *= plant.friction
         model.dof_armature[self.dof] *= plant.armature
@@ -167,8 +167,10 @@ class Replay:
         moved = np.linspace(begin, max(begin, end), _WINDOWS)
         first = np.unique(np.clip(np.searchsorted(log.state_t, moved), 1, len(log.state_t) - 2))
         self.starts = first[log.state_t[first] + _WINDOW_S <= log.state_t[-1] + 1e-9]
+        if drives.free and log.quat is not None:  # a robot that lies touches the ground with what the model may lack
+            self.starts = self.starts[matrices(log.quat[self.starts])[:, 2, 2] > _UPRIGHT]
         if len(self.starts) < 3:
-            raise UsageError("the log is too short for a replay: it needs 1 s")
+            raise UsageError("the log has less than 1 s of an upright robot, too little for a replay")
         self.step_t = np.arange(count) * drives.model.opt.timestep
         self.initial = np.array([self._state(k) for k in self.starts])
         # Measurements at the ends of steps.
@@ -249,41 +251,55 @@ class Replay:
                 break
         return plant
 
-    def fit(self, start: Plant, name: str = "") -> Plant:
+    def fit(self, start: Plant, name: str = "", delays: Sequence[float] = GRIDS["delay_s"]) -> Plant:
         """Return the best plant with another delay, and with another value of one parameter, if one is named."""
         values = [getattr(start, name), *GRIDS[name]] if name else [0.0]
-        grid = [
-            replace(start, delay_s=d, **({name: float(v)} if name else {})) for d in GRIDS["delay_s"] for v in values
-        ]
+        grid = [replace(start, delay_s=d, **({name: float(v)} if name else {})) for d in delays for v in values]
         return self.polished(min(grid, key=self.error), ["delay_s", *([name] if name else []), "kd"])
+
+    def fit_limits(self, start: Plant, delays: Sequence[float]) -> Plant:
+        """Return the best plant with torque limits: a joint's own motion decides about its limit."""
+        best = start
+        each = lambda plant: np.minimum(np.abs(self.residuals(plant)), 1.5).mean((0, 1))  # noqa: E731
+        for delay_s in delays:
+            free = replace(start, delay_s=delay_s, limits=())
+            tried = np.array([each(replace(free, limits=(f,) * len(self.scale))) for f in _LIMITS])
+            found = np.where(tried.min(0) < 0.9 * each(free), np.array(_LIMITS)[tried.argmin(0)], np.inf)
+            if np.isfinite(found).any():
+                best = min(best, replace(free, limits=tuple(found)), key=self.error)
+        for factor in (0.87, 1.15, 0.93, 1.07) if best.limits else ():
+            moved = replace(best, limits=tuple(factor * v for v in best.limits))
+            better = each(moved) < each(best)
+            mixed = replace(best, limits=tuple(np.where(better, moved.limits, best.limits)))
+            best = min(best, mixed, key=self.error)
+        return self.polished(best, ["delay_s", "kd"])
 
     def fit_all(self) -> Plant:
         """Return the plant with as few changes as explain the motion."""
         plant = self.fit(_NOMINAL)
-        single = [self.fit(replace(_NOMINAL, delay_s=plant.delay_s), name) for name in ("kp", "limit")]
-        best = min(single, key=self.error)
+        # Soft or limited drives look late at first, so their own fit looks at shorter delays too.
+        near = sorted({0.004, 0.011, 0.018, plant.delay_s, 0.6 * plant.delay_s})
+        softer, limited = self.fit(_NOMINAL, "kp", near), self.fit_limits(_NOMINAL, near)
+        best = min(softer, limited, key=self.error)
         if self.error(best) > 0.93 * self.error(plant):
             best = plant
         else:
-            other = "limit" if best.limit == 1.0 else "kp"
-            more = min((replace(best, **{other: v}) for v in GRIDS[other]), key=self.error)
-            more = self.polished(more, ["kp", "limit", "delay_s", "kd"])
-            best = more if self.error(more) < 0.88 * self.error(best) else best
+            more = self.fit_limits(best, near) if best.kp != 1.0 else self.fit(best, "kp", near)
+            best = more if self.error(more) < 0.85 * self.error(best) else best
         for name in ("friction", "payload"):
             more = min((replace(best, **{name: v}) for v in GRIDS[name]), key=self.error)
             if self.error(more) < 0.9 * self.error(best):
-                used = [n for n in ("kp", "limit") if getattr(best, n) != 1.0]
-                more = self.polished(more, [name, "delay_s", *used], 2)
+                more = self.polished(more, [name, "delay_s", *(["kp"] if best.kp != 1.0 else [])], 2)
                 best = more if self.error(more) < 0.85 * self.error(best) else best
         return best
 
 
 def _near(name: str, value: float) -> np.ndarray:
     if name == "delay_s":
-        return np.maximum(0.0, value + np.array([-0.006, -0.002, 0.002, 0.006]))
+        return np.maximum(0.0, value + np.array([-0.006, -0.002, -0.001, 0.001, 0.002, 0.006]))
     if name == "payload":
         return value + np.array([-0.05, 0.05])
-    return np.minimum(value * np.array([0.85, 0.93, 1.07, 1.17]), 1.0 if name == "limit" else np.inf)
+    return value * np.array([0.85, 0.93, 1.07, 1.17])
 
 
 def lowest_points(model: Any, data: Any) -> list[tuple[int, np.ndarray]]:
@@ -294,7 +310,7 @@ def lowest_points(model: Any, data: Any) -> list[tuple[int, np.ndarray]]:
         body = int(model.geom_bodyid[i])
         if body == 0 or not (model.geom_contype[i] or model.geom_conaffinity[i]):
             continue
-        if model.geom_type[i] == mujoco.mjtGeom.mjGEOM_SPHERE:
+        if int(model.geom_type[i]) == int(mujoco.mjtGeom.mjGEOM_SPHERE):
             points.append((body, data.geom_xpos[i] - [0, 0, model.geom_size[i, 0]]))
             continue
         box = model.geom_aabb[i, :3] + corners * model.geom_aabb[i, 3:]
@@ -305,7 +321,7 @@ def lowest_points(model: Any, data: Any) -> list[tuple[int, np.ndarray]]:
 
 _TEXTS = {
     "kp": ("gain", "the drives are {kp:.2f} times as stiff as the contract says"),
-    "limit": ("torque limit", "the torque is clipped at about {limit:.0%} of what the targets ask for"),
+    "limits": ("torque limit", "torque is clipped: {clipped}"),
     "delay_s": ("delay", "motion follows a target after {ms:.0f} ms; the training had {trained}"),
     "friction": ("friction", "the joints have {friction:.1f} times the model's friction"),
     "payload": ("payload", "the robot carries {payload:+.0%} of its mass beside the model's"),
@@ -331,32 +347,39 @@ def solve_plant(
         value = getattr(fitted, name)
         if not _is_off(name, value, fitted.delay_s + age_s, trained):
             continue
-        others = [n for n in ("kp", "limit", "delay_s", "kd") if n != name and getattr(fitted, n) != 1.0]
+        others = [n for n in ("kp", "delay_s", "kd") if n != name and getattr(fitted, n) != 1.0]
         usual = getattr(_NOMINAL, name) if name != "delay_s" else max(0.0, (trained or 0.0) - age_s)
         without = replay.polished(replace(fitted, **{name: usual}), others, 2)
         factor = replay.error(without) / max(best, 1e-9)
-        if factor < (_CLEAR if name in ("kp", "limit", "delay_s") else 1.25):
+        if factor < (_CLEAR if name in ("kp", "limits", "delay_s") else 1.25):
             continue
         known = f"{1e3 * trained:.0f} ms" if trained is not None else "none that is known"
-        text = words.format(ms=1e3 * (fitted.delay_s + age_s), trained=known, **vars(fitted))
+        torques = replay.asked * fitted.limits if fitted.limits else replay.asked
+        clipped = ", ".join(
+            f"{j} at {t:.3g} N m" for j, t in zip(contract.joints, torques, strict=True) if np.isfinite(t)
+        )
+        text = words.format(ms=1e3 * (fitted.delay_s + age_s), trained=known, clipped=clipped, **vars(fitted))
+        value = value if name != "limits" else min(value)
         share = float(np.clip((replay.error(without) - best) / max(base, best), 0.0, 1.0))
         findings.append(Finding(fault, "timing" if name == "delay_s" else "plant", text, share, {name: float(value)}))
     per_joint = [np.abs(replay.residuals(p)).mean((0, 1)) for p in (nominal, fitted)]
     figures = {
         "error": base, "error_fitted": best, "delay_s": fitted.delay_s + age_s,
-        **{n: getattr(fitted, n) for n in ("kp", "kd", "limit", "friction", "payload")},
+        **{n: getattr(fitted, n) for n in ("kp", "kd", "friction", "payload")},
         "joints": {j: [float(a), float(b)] for j, a, b in zip(contract.joints, *per_joint, strict=True)},
         "parting": parting(replay, fitted, contract.joints),
     }  # fmt: skip
     return findings, figures
 
 
-def _is_off(name: str, value: float, delay_s: float, trained: float | None) -> bool:
+def _is_off(name: str, value: Any, delay_s: float, trained: float | None) -> bool:
     if name == "delay_s":
         return delay_s > (0.010 if trained is None else trained) + _LATER_S
     if name == "kp":
         return not _GAIN_BAND[0] <= value <= _GAIN_BAND[1]
-    return {"limit": value < 0.9, "friction": value > 3.0, "payload": abs(value) > 0.12}[name]
+    if name == "limits":
+        return bool(value)
+    return value > 3.0 if name == "friction" else abs(value) > 0.12
 
 
 def _age_s(log: Log) -> float:
@@ -377,5 +400,5 @@ def parting(replay: Replay, plant: Plant, joints: Sequence[str]) -> dict[str, An
         "time_s": float(replay.log.state_t[k]), "joint": joints[joint], "apart": bool(len(worse)),
         "error": float(error[first, joint]), "t": (replay.step_t + d.model.opt.timestep).tolist(),
         "measured": replay.measured[first, :, joint].tolist(),
-        "simulated": np.where(replay.used[first], simulated, np.nan).tolist(),
+        "simulated": [float(v) if ok else None for v, ok in zip(simulated, replay.used[first], strict=True)],
     }  # fmt: skip

@@ -99,7 +99,7 @@ def _parting(at: dict[str, Any]) -> FigureBlock:
         axis = figure.subplots()
         times = at["time_s"] + np.array(at["t"])
         for name, role in (("measured", "measured"), ("simulated", "identified")):
-            values = np.array(at[name])
+            values = np.array(at[name], float)
             axis.plot(times[np.isfinite(values)], values[np.isfinite(values)], color=ROLES[role].color,
                       linestyle=ROLES[role].dash, marker=".", label=name)  # fmt: skip
         axis.set_xlabel("time [s]")
