@@ -14,7 +14,7 @@ from sim2real.errors import DelayChanged, Sim2RealError
 from sim2real.policy import PolicyContract, save_bundle
 from sim2real.robots.probe import StepAnswers, Witness
 from sim2real.stages.config import DeployConfig
-from sim2real.stages.deploy import episodes, preflight
+from sim2real.stages.deploy import episodes, stage
 from sim2real.stages.load import load_robot
 
 TRAINED = (0.044, 0.046)
@@ -44,7 +44,7 @@ def contract_of(robot, /, **changes):
 def admit(robot, contract, name="arm", **config):
     robot = copy.copy(robot)
     robot.name, robot.folder = name, load_robot("arm").folder
-    preflight.require_fit(robot, Bundle(contract, still(contract)), DeployConfig(**config))
+    stage.require_fit(robot, Bundle(contract, still(contract)), DeployConfig(**config))
 
 
 @pytest.fixture(scope="module")
@@ -132,11 +132,11 @@ def test_a_bundle_that_its_training_did_not_write_is_refused(arm, tmp_path):
     path = save_bundle(tmp_path / "train" / "bundle", still(contract), contract)
     outputs = {"bundle": Source("bundle", sha256(path))}
     trained = StageFolder(path.parent, Manifest("arm", "train", "finished", "", outputs=outputs))
-    preflight.require_untouched(trained)
+    stage.require_untouched(trained)
     about = json.loads((path / "policy.json").read_text())  # the hashes in it still fit: only the manifest tells
     (path / "policy.json").write_text(json.dumps({**about, "rate_hz": 51.0}))
     with pytest.raises(Sim2RealError, match=r"(?s)not the bundle that its training wrote.*hint: train again"):
-        preflight.require_untouched(trained)
+        stage.require_untouched(trained)
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 """The tables and texts that the stage train prints."""
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any
 
 from sim2real.artifacts.bundle import History
 from sim2real.artifacts.episodes import Episodes
@@ -20,23 +20,7 @@ Watch = Callable[[Progress], None]
 """A function that receives the figures of each evaluation."""
 
 
-class ProgressBar(Protocol):
-    """The part of tqdm's bar that is used here."""
-
-    def set_description_str(self, desc: str) -> None:
-        """Set the text before the bar."""
-        ...
-
-    def set_postfix_str(self, s: str) -> None:
-        """Set the text behind the bar."""
-        ...
-
-    def update(self, n: float) -> bool | None:
-        """Advance the bar."""
-        ...
-
-
-def show_progress(bar: ProgressBar, p: Progress, watch: Watch | None) -> None:
+def show_progress(bar: Any, p: Progress, watch: Watch | None) -> None:
     """Show an evaluation's figures behind the progress bar, after ``watch`` has received them."""
     if watch is not None:
         watch(p)

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Protocol, runtime_checkable
+from typing import Any
 
 import jax
 import numpy as np
@@ -29,7 +29,6 @@ from sim2real.training.networks.onnx_export import export_graph
 from sim2real.training.networks.policy import Policy
 from sim2real.training.ppo.trainer import TrainResult
 from sim2real.training.sweep import Sweep, format_point
-from sim2real.types import Array, PyTree
 
 MAX_OBSERVATIONS = 1000
 """Number of observations of one source that are compared."""
@@ -116,29 +115,6 @@ def _trained(values: Mapping[str, float], episodes: Episodes) -> dict[str, tuple
     return trained
 
 
-@runtime_checkable
-class _Agent(Protocol):
-    """A supervisor with the methods of a ``TrainingTask``."""
-
-    name: str
-
-    def init_params(self, rng: jax.Array | None, graph_state: GraphState) -> PyTree:
-        """Return the parameters."""
-        ...
-
-    def init_state(self, rng: jax.Array | None, graph_state: GraphState) -> PyTree:
-        """Return the state."""
-        ...
-
-    def observe(self, step_state: StepState) -> jax.Array:
-        """Return the observation, shape ``(O,)``."""
-        ...
-
-    def act(self, step_state: StepState, action: Array) -> tuple[StepState, PyTree]:
-        """Return the new step state and the output."""
-        ...
-
-
 def has_readings(robot: Robot, recording: Recording) -> bool:
     """Return whether a log has all readings of a robot; one of another recorder may lack velocities."""
     return set(named_leaves(robot.sensor.at_rest)) <= set(recording.episode.outputs.get(SENSOR, {}))
@@ -146,8 +122,9 @@ def has_readings(robot: Robot, recording: Recording) -> bool:
 
 def observations_of(robot: Robot, recording: Recording, runner: PolicyRunner) -> np.ndarray:
     """Return the observations ``(N, O)`` that a policy would get from a recording's measurements."""
-    agent, sensor = robot.agent.make(robot.rate_hz), SENSOR
-    if not isinstance(agent, _Agent):
+    agent: Any = robot.agent.make(robot.rate_hz)
+    sensor = SENSOR
+    if not (hasattr(agent, "observe") and hasattr(agent, "act")):
         raise Sim2RealError(f"a {type(agent).__name__} has no `observe` and `act`, which a policy needs")
 
     # Arrange the recorded readings as the leaves of a message.
