@@ -294,7 +294,8 @@ def compare_recordings(problem: Problem, at: Linearised) -> tuple[Quantity, ...]
     for i, p in enumerate(table.columns):
         values = np.array([table.unscale(x)[i] for x, _ in alone])
         errors = np.array([np.sqrt(cov[i, i]) * abs(table.slope(x)[i]) for x, cov in alone])
-        rows.append(aggregate(values, errors, p.name, p.unit))
+        row = aggregate(values, errors, p.name, p.unit)
+        rows.append(replace(row, low95=max(row.low95, p.low), high95=min(row.high95, p.high)))
     return tuple(rows)
 
 

@@ -293,3 +293,7 @@ def test_each_recording_alone_is_a_linear_step_from_all(monkeypatch):
     assert row.standard_errors == pytest.approx([0.1 / np.sqrt(200)] * 3, rel=0.3)
     assert row.mean == pytest.approx(0.0, abs=0.02)
     assert not row.agree
+    assert row.low95 < -1.0
+    bounded = table_of(Parameter("a", "1", 0.0, -1.0, 9.0, "linear"))
+    (row,) = uncertainty.compare_recordings(stub(bounded), at)
+    assert row.low95 == -1.0, "no further recording has a value beyond the bounds"
