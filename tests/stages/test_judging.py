@@ -35,7 +35,7 @@ def deployed(identified=0.01, here=0.01, success=1.0, simulated=1.0, drift=STEAD
     """A deployment: how far models are off, how well it went, what has changed, and how long steps took."""
     rows = (Replay("hinge", "rad", 0.1, {"identified": identified, verdict.AS_HERE: here, "hold": 0.5}, 0.01),)
     logs = tuple(Recording(Path(f"runs/pendulum/T/deploy/episode_{i}.mcap"), episode(seconds, took_s)) for i in (0, 1))
-    gap = (Gap("success", success, simulated, success - simulated),)
+    gap = (Gap("success", success, simulated, None if success is None else success - simulated),)
     return Deployment((Scores({}),) * 2, gap, recordings=logs, replay=rows, drift=drift)
 
 
@@ -51,7 +51,10 @@ def deployed(identified=0.01, here=0.01, success=1.0, simulated=1.0, drift=STEAD
         ({"identified": 0.04}, "re-identify", "expected were 0.01 rad"),
         ({"identified": None}, "re-identify", "it diverges"),
         ({"took_s": 0.0025}, "fine", "as fast as in training"),
-        ({"took_s": 0.004}, "re-train", "100.0% of the steps of agent take longer than the 1.0 ms of training"),
+        ({"took_s": 0.004}, "fine", "and the policy succeeds"),
+        ({"took_s": 0.004, "success": 0.7}, "re-train",
+         "100.0% of the steps of agent take longer than the 1.0 ms of training"),
+        ({"took_s": 0.004, "success": None}, "re-train", "100.0% of the steps of agent take longer"),
         ({"success": 0.7}, "re-train", "success is 0.70, in simulation 1.00"),
         ({"success": 0.85, "simulated": 0.9}, "re-train", "as in simulation"),
         ({"identified": 0.5, "here": 0.2, "drift": ALARM}, "re-identify", "friction is 12 rad/s^2"),

@@ -86,9 +86,9 @@ def judge(
 def verdict(deployment: Deployment, bundle: Bundle) -> Advice:
     """Return the verdict on a deployment, without the next command.
 
-    The first finding decides: a wrong model, see ``model_advice``; a policy that was trained for other times, or that
-    does not succeed often enough. A change of a parameter is no reason to identify again while the policy succeeds and
-    all predictions are within their expected errors.
+    The first finding decides: a wrong model, see ``model_advice``; a policy that does not succeed often enough. While
+    the policy succeeds and all predictions are within their expected errors, a change of a parameter is no reason to
+    identify again, and late steps are none to train again.
 
     Args:
         deployment: With replay, drift and times.
@@ -100,6 +100,8 @@ def verdict(deployment: Deployment, bundle: Bundle) -> Advice:
     if model is not None:
         return model
     if policy is None:
+        if late := _late_nodes(deployment, bundle):
+            return Advice("fine", ("the robot is the one that was identified, and the policy succeeds", *late))
         return Advice("fine", ("the robot is the one that was identified, and as fast as in training",))
     if (lost_s := max(map(_lost_s, deployment.recordings), default=0.0)) > _MAX_PAUSES_S:
         pause = f"an episode lost {lost_s:.2g} s {PAUSED}, and no simulation has such pauses"
@@ -144,17 +146,20 @@ def model_advice(replay: Sequence[Replay], drift: Drift | None) -> Advice | None
 
 
 def _policy_advice(deployment: Deployment, bundle: Bundle) -> Advice | None:
-    """Return the finding about the policy; None if it succeeds often enough at the times of training."""
-    if late := _late_nodes(deployment, bundle):
-        return Advice("re-train", tuple(late))
+    """Return the finding about the policy; None if it succeeds often enough.
+
+    Steps that take longer than in training explain a failure; they are none. Where nothing measures success, they are
+    all that is known.
+    """
+    late = tuple(_late_nodes(deployment, bundle))
     success = next((g for g in deployment.gap if g.quantity == "success"), None)
     if success is None or success.real is None:
-        return None
+        return Advice("re-train", late) if late else None
     simulated = success.simulation if success.simulation is not None else 1.0
     if success.real < min(GOOD_SUCCESS, simulated - _MAX_SUCCESS_GAP):
-        return Advice("re-train", (f"success is {success.real:.2f}, in simulation {simulated:.2f}",))
+        return Advice("re-train", (*late, f"success is {success.real:.2f}, in simulation {simulated:.2f}"))
     if success.real < GOOD_SUCCESS:
-        return Advice("re-train", (f"success is {success.real:.2f}, as in simulation",))
+        return Advice("re-train", (*late, f"success is {success.real:.2f}, as in simulation"))
     return None
 
 
