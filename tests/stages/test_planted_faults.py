@@ -1,7 +1,6 @@
-"""Twelve faults, each planted in a log of an arm: the identification is rejected, and its page shows where.
+"""Twelve faults, each planted in a log of an arm: the identification is rejected, and its worst second is the fault's.
 
-Each log is simulated in C MuJoCo and identified with the command line, without folds and free runs. The page's first
-figure is compared as data: its joint, its second, and the measured values in it.
+Each log is simulated in C MuJoCo and identified with the command line, without folds and free runs.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from sketches import sketched
 
 from sim2real import cli
 
@@ -176,38 +174,16 @@ def identified(t: np.ndarray, goal: np.ndarray, q: np.ndarray) -> tuple[Path, di
     return folder, json.loads((folder / "parameters.json").read_text())
 
 
-@pytest.mark.night  # `make test` finds the worst second in test_worst_second.py, and rejects models in test_verdict.py
+@pytest.mark.night
 @pytest.mark.parametrize("name", FAULTS)
-def test_the_first_figure_shows_the_fault(name, tmp_path, monkeypatch, capsys):
+def test_a_faulty_log_is_rejected_with_the_second_of_the_fault(name, tmp_path, monkeypatch):
     log, joints, end_s = FAULTS[name]
-    t, goal, q = log()
     monkeypatch.chdir(tmp_path)
-    with sketched() as figures:
-        folder, result = identified(t, goal, q)
-    said = capsys.readouterr().err
-    assert result["verdict"]["status"] != "accepted", said
-    # The first figure of the page is that of the worst second: joint, shaded second, and measured values.
-    upper, _ = figures[0].axes
-    joint, _, unit = upper.get_ylabel().partition(" ")
-    assert joint in joints, said
-    assert unit == "[rad]"
-    (shaded,) = upper.patches
-    first_s, last_s = shaded.get_x(), shaded.get_x() + shaded.get_width()
-    assert first_s >= BEGIN_S - 0.5, said
-    assert last_s <= end_s + 0.5, said
-    measured = next(
-        np.array(line.get_data()) for line in upper.lines if line.get_linestyle() == "-" and line.get_lw() == 1.5
-    )
-    at = np.isfinite(measured[0]) & (measured[0] >= first_s) & (measured[0] <= last_s)
-    np.testing.assert_allclose(measured[1, at], np.interp(measured[0, at], t, q[:, JOINTS.index(joint)]), atol=2e-3)
-    # Page, console and JSON have the same joint, time and error.
-    text = re.search(r"worst: (joint .*)", said)[1]
-    page = (folder.parent / "report.html").read_text()
-    assert page.index("identify-worst-") == min(m.start() for m in re.finditer("identify-[a-z]+-figure_", page))
-    assert text in page
+    _, result = identified(*log())
+    assert result["verdict"]["status"] != "accepted"
     worst = result["worst"]
-    assert text.startswith(f"joint {worst['name']}, {worst['begin_s']:.1f} s, ")
-    assert worst["begin_s"] == pytest.approx(first_s)
+    assert worst["name"] in joints
+    assert BEGIN_S - 0.5 <= worst["begin_s"] <= end_s - 0.5
 
 
 @pytest.mark.night
