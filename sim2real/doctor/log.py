@@ -14,8 +14,8 @@ from sim2real.log.importing.names import columns_of
 
 _NAMES = {
     "t": "t time time_s stamp timestamp t_s",
-    "q": "q position positions joint_pos joint_position dof_pos qpos",
-    "dq": "dq qd velocity velocities joint_vel joint_velocity dof_vel qvel",
+    "q": "q th theta position positions joint_pos joint_position dof_pos qpos",
+    "dq": "dq thdot qd velocity velocities joint_vel joint_velocity dof_vel qvel",
     "quat": "quat quaternion orientation base_quat imu_quat",
     "gyro": "gyro ang_vel angular_velocity base_ang_vel imu_gyro",
     "lin_vel": "lin_vel base_lin_vel linear_velocity",
@@ -95,7 +95,7 @@ def read_deployment(path: Path, joints: Sequence[str], actions: int, robot_joint
     times: dict[str, np.ndarray] = {}
     for name, values in signals.items():
         signal = _signal_of(name)
-        if signal is not None and (signal not in found or _rank(name) > 0):
+        if signal is not None and signal not in found:
             found[signal], times[signal] = np.asarray(values, float), stamps.get(name, np.zeros(0))
             if signal in ("q", "dq", "target", "torque"):
                 found[signal] = _in_order(found[signal], named.get(name, []) or robot_joints, joints, name)
@@ -141,13 +141,16 @@ def _at(values: np.ndarray, times: np.ndarray | None, step_t: np.ndarray) -> np.
 
 
 def _signal_of(name: str) -> str | None:
-    parts = re.split(r"[./]", name.lower())
-    return None if parts[0] in _UNUSED_NODES else _OF_NAME.get(parts[-1])
-
-
-def _rank(name: str) -> int:
-    """Return 1 for the source of a signal that is preferred: the drives' commands are those that were sent."""
-    return int(name.lower().startswith(("actuator", "sensor")))
+    """Return the signal of a name: a joint's angle is measured, or a target if the name is of a command."""
+    *nodes, last = re.split(r"[./]", name.lower())
+    if nodes[:1] and nodes[0] in _UNUSED_NODES:
+        return None
+    signal = _OF_NAME.get(last)
+    if nodes[:1] == ["agent"]:
+        return signal if signal in ("action", "obs", "command") else None
+    if any(node == "actuator" or node.endswith("cmd") for node in nodes):
+        return "target" if signal in ("q", "target", "action", "torque") else None
+    return signal
 
 
 def _in_order(values: np.ndarray, names: Sequence[str], joints: Sequence[str], signal: str) -> np.ndarray:

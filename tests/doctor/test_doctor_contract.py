@@ -12,6 +12,8 @@ from sim2real.doctor.contract import Contract, Policy, Term, contract_facts, con
 from sim2real.doctor.log import read_deployment
 from sim2real.doctor.solve import mirror_of, solve_contract
 from sim2real.errors import UsageError
+from sim2real.graph.episode import StepRecord
+from sim2real.log.writer import SessionFile
 from sim2real.policy import load_bundle
 
 JOINTS = ("FL_hip", "FL_calf", "FR_hip", "FR_calf")
@@ -109,6 +111,28 @@ def test_columns_by_name_come_in_the_contracts_order(tmp_path: Path) -> None:
     assert log.q[0].tolist() == [3, 2, 1, 0]
     assert log.target is not None
     assert log.target[0].tolist() == [13, 12, 11, 10]
+
+
+def test_commands_of_this_projects_logs_are_no_measurements(tmp_path: Path) -> None:
+    """The Go2's actuator has a field q, as its motors have."""
+    four = np.zeros(4)
+    sensor, agent = {"position": four, "velocity": four}, {"q": four, "aim": np.zeros(2)}
+    outputs = {"sensor": sensor, "agent": agent, "actuator": {"q": four, "tau": four}}
+    log = SessionFile(tmp_path / "real.mcap", {"pipeline": "go2"}, {}, outputs, [], {})
+    log.start(0, 0)
+    for i in range(50):
+        for k, (node, leaves) in enumerate(outputs.items()):
+            at = 20_000 * i + 2_000 * k
+            log.step(StepRecord(node, i, at, at, at, -1, at + 1000, 0), [v + k + 0.01 * i for v in leaves.values()])
+    log.finish({})
+    read = read_deployment(tmp_path / "real.mcap", JOINTS, 4)
+    assert read.q[10].tolist() == pytest.approx([0.1] * 4)
+    assert read.target is not None
+    assert read.target[10].tolist() == pytest.approx([2.1] * 4)
+    assert read.command is not None
+    assert read.command.shape == (50, 2)
+    assert read.action is None
+    assert read.t[1] - read.t[0] == pytest.approx(0.02)
 
 
 def test_a_log_without_actions_and_targets_is_refused(tmp_path: Path) -> None:
