@@ -23,7 +23,7 @@ from sim2real.emulation.legs import UnitreeEmulation  # noqa: E402
 from sim2real.emulation.process import EmbeddedRobot  # noqa: E402
 from sim2real.emulation.truth import Kind  # noqa: E402
 from sim2real.errors import HardwareLost  # noqa: E402
-from sim2real.hardware.unitree import guarded  # noqa: E402
+from sim2real.hardware.unitree import device  # noqa: E402
 from sim2real.hardware.unitree.dds import Address, DdsLink  # noqa: E402
 from sim2real.hardware.unitree.device import UnitreeLegs  # noqa: E402
 from sim2real.hardware.unitree.messages import COMMAND_TOPIC, LowCmd  # noqa: E402
@@ -48,7 +48,7 @@ def test_it_starts_in_a_domain_without_programs_and_one_that_is_not_there_is_los
             link.close()
     finally:
         left_behind.close()
-    monkeypatch.setattr(guarded, "_OPEN_S", 0.2)
+    monkeypatch.setattr(device, "_OPEN_S", 0.2)
     with pytest.raises(HardwareLost, match="has sent no state"):
         UnitreeLegs("lo:9").open()
 

@@ -1,17 +1,26 @@
 """A Go2's legs as a device, over its low-level interface."""
 
+import atexit
+import logging
 import math
+import os
+import threading
+import uuid
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
 
 from sim2real.errors import HardwareLost, SafetyStop, UsageError
+from sim2real.hardware.clock import SYSTEM_CLOCK, Clock
 from sim2real.hardware.device import (
     Alone,
     CommandColumn,
     CommandKind,
+    Counters,
     Device,
     Reading,
     ReadingPart,
@@ -19,11 +28,11 @@ from sim2real.hardware.device import (
     WithoutHost,
 )
 from sim2real.hardware.safety.following import Following
-from sim2real.hardware.unitree.dds import Address
-from sim2real.hardware.unitree.guarded import GuardedLegs
+from sim2real.hardware.safety.guardian import Guardian
+from sim2real.hardware.unitree.dds import LEASE_S, Address, DdsLink, StateStream, connect
 from sim2real.hardware.unitree.legs import NAMES, TORQUE_NM, LegDrive, command
-from sim2real.hardware.unitree.messages import MOTORS, LowCmd, LowState
-from sim2real.hardware.unitree.sit_down import motors_on
+from sim2real.hardware.unitree.messages import COMMAND_TOPIC, MOTORS, LowCmd, LowState
+from sim2real.hardware.unitree.sit_down import motors_on, sit_down
 
 PARTS: Final[Mapping[str, ReadingPart]] = MappingProxyType(
     {
@@ -44,18 +53,31 @@ _SOURCE: Final = (
     "Unitree documents no reaction of a Go2; a motor of its GO family goes on (unitree_actuator_sdk, issue 29); "
     "not measured by us"
 )
+_LOGGER = logging.getLogger(__name__)
+_OPEN_S: Final = 3.0
+_DISCOVERY_S: Final = 1.0
+"""Time in which DDS finds the writers of a robot's domain [s]."""
+_CONFIRM_S: Final = 1.0
+"""Longest time in which motors confirm that they are on, or off [s]."""
+_SETTLE_S: Final = 1.5
+"""Longest time in which the guardian takes the torque off once the legs have damped [s]."""
 
 
-class UnitreeLegs(GuardedLegs, Device):
+class UnitreeLegs(Device):
     """The twelve motors of a Go2, each with a position controller, a velocity controller and a torque.
 
     The robot publishes its state at 500 Hz without a request; `measure` waits for the next one. A command is published
-    once. If commands stop, the guardian lets the legs damp and takes the torque off.
+    once. If commands stop, the guardian lets the legs damp and takes the torque off when the robot
+    lies: a process with a writer of its own, which starts before torque goes on.
 
     Args:
         port: Network interface and DDS domain, such as ``eth0:0``; see `Address`.
         ids: Places of the motors in the messages, in the order of the joints; each of 0 to 11 once.
         max_silence_s: Time without a state after which the robot is lost [s].
+
+    Attributes:
+        armed: Whether commands are published.
+        halted: Whether torque stays off because `make_safe` or `close` was called.
 
     Raises:
         UsageError: A motor is missing, or the port has no domain.
@@ -72,10 +94,19 @@ class UnitreeLegs(GuardedLegs, Device):
     ) -> None:
         if sorted(ids) != list(range(MOTORS)):
             raise UsageError(f"motors {list(ids)}: a Go2 has the motors 0 to {MOTORS - 1}, each once")
-        super().__init__(Address.parse(port), drive or LegDrive(), silence_s, max_silence_s)
+        self.address, self.drive = Address.parse(port), drive or LegDrive()
+        self._silence_s, self._max_silence_s = silence_s, max_silence_s
         self._places = np.array(ids)
-        self._rest = np.zeros((MOTORS, 5))
-        self._left = 1.0
+        self._rest, self._left = np.zeros((MOTORS, 5)), 1.0
+        self._damp = self.drive.damp()  # built here, as make_safe must not need any time
+        self._clock: Clock = SYSTEM_CLOCK
+        self._robot: DdsLink | None = None
+        self._stream: StateStream | None = None
+        self._guardian: Guardian | None = None
+        self.armed = self.halted = False
+        self._on = self._leaving = False
+        self._published = 0
+        self._commanding = threading.Lock()
 
     @property
     def motors(self) -> tuple[str, ...]:
@@ -109,6 +140,63 @@ class UnitreeLegs(GuardedLegs, Device):
         """The parts `PARTS`."""
         return PARTS
 
+    @property
+    def clock(self) -> Clock:
+        """The clock of the connection; before it is open, the machine's."""
+        return self._clock
+
+    @property
+    def robot(self) -> DdsLink:
+        """The open connection; raise HardwareLost if it is not open."""
+        if self._robot is None:
+            raise HardwareLost(f"the robot on {self.address} is not open", hint="call open first")
+        return self._robot
+
+    @property
+    def guardian_pid(self) -> int | None:
+        """Process id of the guardian; None before it is started."""
+        return None if self._guardian is None else self._guardian.pid
+
+    @property
+    def counters(self) -> Counters:
+        """Counts of states and commands since `open`."""
+        return Counters() if self._stream is None else self._stream.counters(self._published)
+
+    def open(self) -> None:
+        """Connect, wait for states, and lay the robot down if its motors are on.
+
+        Raises:
+            HardwareLost: The interface does not exist, the robot is silent, or another program publishes commands.
+        """
+        if self._robot is not None:
+            raise UsageError("the robot is open already", hint="close it first")
+        self.armed = self.halted = self._on = self._leaving = False
+        self._published = 0
+        mark = f"sim2real {uuid.uuid4().hex[:8]} of process {os.getpid()}"
+        robot = connect(self.address, mark)
+        self._clock = robot.clock
+        try:
+            # States must come, and no other writer may command the motors.
+            stream = StateStream(robot, self._max_silence_s)
+            state = stream.begin(_OPEN_S)
+            # Motors that are on have a program, perhaps one that is not discovered yet: to damp would lay it down.
+            end_s = self._now_s() + (_DISCOVERY_S if motors_on(state) else 0.0)
+            while not robot.other_writers() and self._now_s() < end_s:
+                self.clock.sleep(0.05)
+            # A program that was killed is a writer until its lease is over.
+            end_s = self._now_s() + LEASE_S + 1.0
+            while robot.other_writers() and self._now_s() < end_s:
+                self.clock.sleep(0.05)
+            _require_alone(robot, HardwareLost)
+            # A program that was killed without a guardian may have left the motors on.
+            if motors_on(state) and (failure := sit_down(robot, self.drive, _CONFIRM_S)):
+                raise HardwareLost(failure, hint="switch the robot off")
+        except BaseException:
+            robot.close()
+            raise
+        self._robot, self._stream = robot, stream
+        atexit.register(self.close)
+
     def without_host(self) -> tuple[WithoutHost, ...]:
         """Return the worst reaction, as none is documented."""
         return (WithoutHost("Go2", self.motors, Alone.GOES_ON, math.inf, _SOURCE, "no other reaction is documented"),)
@@ -116,7 +204,7 @@ class UnitreeLegs(GuardedLegs, Device):
     def facts(self) -> dict[str, dict[str, str]]:
         """Return the versions that the robot's state has, the battery's voltage and the motors' temperatures."""
         # Versions of 0 are those that the robot does not report.
-        record = self.session.stream.next()[0].record
+        record = self._next()[0].record
         bms = record["bms_state"]
         numbers = {"LowState": record["version"].tolist(), "battery": [bms["version_high"], bms["version_low"]]}
         versions = {name: ".".join(map(str, pair)) for name, pair in numbers.items() if any(pair)}
@@ -139,7 +227,7 @@ class UnitreeLegs(GuardedLegs, Device):
         # A robot that lies may rest on the stops of its joints, a little beyond their range.
         self._rest[:, 0] = np.clip(self.measure().position_rad, low[:, 0], high[:, 0])
         self._rest[:, 3] = self.drive.damping
-        self.switch_on(self._message(self._rest))
+        self._switch_on(self._message(self._rest))
 
     def following(self) -> Following:
         """Return by how much a motor's torque may be weaker than its law."""
@@ -152,10 +240,10 @@ class UnitreeLegs(GuardedLegs, Device):
     def measure(self) -> Reading:
         """Wait for the next state: positions [rad], speeds [rad/s], estimated torques [N m], and `PARTS`."""
         # A guardian that has taken over is the reason of silence and of torque that is off.
-        self.beat()
+        self._beat()
         armed = self.armed
         try:
-            state, transaction = self.session.stream.next()
+            state, transaction = self._next()
         except HardwareLost:
             self.require_watching()
             raise
@@ -168,12 +256,20 @@ class UnitreeLegs(GuardedLegs, Device):
         """Publish q, dq, kp, kd and tau of all motors, ``(12, 5)``.
 
         Raises:
-            SafetyStop: A value is not finite or beyond the reach, or the torque is off.
+            SafetyStop: A value is not finite or beyond the reach, the torque is off, or the guardian has taken over.
         """
         called_ns = self.clock.now_ns()
         self._require_possible(values)
-        begin_ns, transfer_ns = self.publish(self._message(values))
-        return Transaction(begin_ns, begin_ns - called_ns, transfer_ns, 0)
+        message = self._message(values)
+        with self._commanding:
+            begin_ns = self.clock.now_ns()
+            if self.halted or not self.armed:
+                raise SafetyStop("no command is sent: the torque is off", hint="enable it, or open the robot again")
+            self._beat()
+            self.robot.write(message)
+            self._stop_if_halted()
+            self._published += 1
+            return Transaction(begin_ns, begin_ns - called_ns, self.clock.now_ns() - begin_ns, 0)
 
     def soften(self, command: np.ndarray, left: float) -> np.ndarray:
         """Return the command with a smaller position gain and torque, and more damping: the robot sinks."""
@@ -183,6 +279,120 @@ class UnitreeLegs(GuardedLegs, Device):
         softer = command * [1.0, share, share, share, share]
         softer[:, 3] += (1.0 - share) * self.drive.damping
         return softer
+
+    def check(self) -> None:
+        """Raise SafetyStop if another program publishes commands too."""
+        if self.armed:
+            _require_alone(self.robot, SafetyStop)
+
+    def require_watching(self) -> None:
+        """Raise SafetyStop as `beat` does, also when no sign of life is due."""
+        if self.armed and self._guardian is not None:
+            self._guardian.require_watching()
+
+    def disable(self) -> None:
+        """Let the legs damp until they are still, at most `LegDrive.lie_s`; then torque off, confirmed."""
+        robot, guardian = self.robot, self._guardian
+        with self._commanding:  # a command that is being published comes first
+            self.armed = False
+        if self._on and guardian is not None:
+            if failure := self._lie_down(robot, guardian):
+                raise HardwareLost(failure, hint="switch the robot off")
+            guardian.disarm()
+
+    def make_safe(self) -> None:
+        """Let all motors damp now; the guardian takes their torque off when the robot lies. Never raises."""
+        self.halted, self.armed = True, False
+        robot, guardian = self._robot, self._guardian
+        if robot is None or guardian is None or not self._on or self._leaving:
+            return
+        with suppress(Exception):
+            robot.write(self._damp)
+        guardian.trip()
+
+    def close(self) -> None:
+        """Lay the robot down and disconnect. Never raises; if the motors do not confirm, the guardian goes on."""
+        robot, guardian = self._robot, self._guardian
+        if robot is None:
+            return
+        self.halted, self.armed = True, False
+        # A command that is being published comes first; a signal handler may have interrupted it, so do not wait long.
+        if self._commanding.acquire(timeout=_CONFIRM_S):
+            self._commanding.release()
+        self._leaving = True
+        if guardian is not None:
+            failure = self._lie_down(robot, guardian) if self._on else ""
+            if failure:
+                _LOGGER.error("the torque may be on: %s", failure)
+            guardian.end(confirmed=not failure)
+        robot.close()
+        self._robot = self._stream = self._guardian = None
+        self._on = False
+        atexit.unregister(self.close)
+
+    def _switch_on(self, message: LowCmd) -> None:
+        """Start the guardian, and publish a command until a state shows every motor on."""
+        robot = self.robot
+        if self.halted:
+            raise SafetyStop("torque stays off: the legs have been made safe", hint="open the robot again")
+        # The guardian watches before the first command.
+        if self._guardian is None:
+            self._guardian = robot.guardian(self.drive, self._silence_s, self.drive.lie_s + _SETTLE_S)
+        _require_alone(robot, SafetyStop)
+        self._guardian.arm()
+        # Commands may be lost, so each state is answered with one until all motors are on.
+        with self._commanding:
+            self._on, end_s = True, self._now_s() + _CONFIRM_S
+            try:
+                while not self.halted:
+                    robot.write(message)
+                    off = set(NAMES) - set(motors_on(self._next()[0]))
+                    if not off:
+                        self.armed = True
+                        break
+                    if self._now_s() > end_s:
+                        raise HardwareLost(
+                            f"{', '.join(sorted(off))} did not switch on for {_CONFIRM_S:g} s",
+                            hint="look at the robot's temperatures and battery",
+                        )
+                    self._guardian.beat()
+            finally:
+                self._stop_if_halted()
+
+    def _lie_down(self, robot: DdsLink, guardian: Guardian) -> str:
+        """Lay the robot down, and return the failure or "". A guardian that has taken over lets it damp before."""
+
+        def live() -> None:
+            with suppress(SafetyStop):  # it takes over, or has died: go on all the same
+                guardian.beat()
+
+        guardian.settle()
+        drive = replace(self.drive, lie_s=0.0) if guardian.took_over else self.drive
+        try:
+            failure = sit_down(robot, drive, _CONFIRM_S, live)
+        except Exception as error:  # whatever it is, the guardian goes on
+            failure = f"{type(error).__name__}: {error}"
+        self._on = bool(failure)
+        return failure
+
+    def _next(self) -> tuple[LowState, Transaction]:
+        """Return the first state that arrives from now on, and its times."""
+        if self._stream is None or self._robot is None:
+            raise HardwareLost(f"the robot on {self.address} is not open", hint="call open first")
+        return self._stream.next()
+
+    def _beat(self) -> None:
+        """Give the guardian a sign of life; raise SafetyStop if it has taken over, or has died."""
+        if self.armed and self._guardian is not None:
+            self._guardian.beat()
+
+    def _stop_if_halted(self) -> None:
+        """Damp again after `make_safe`, as a command may have followed it."""
+        if self.halted:
+            self.make_safe()
+
+    def _now_s(self) -> float:
+        return 1e-9 * self.clock.now_ns()
 
     def _message(self, values: np.ndarray) -> LowCmd:
         columns = np.empty((MOTORS, 5))
@@ -216,6 +426,14 @@ class UnitreeLegs(GuardedLegs, Device):
                 f"{self.motors[row]}: {self.commanded.columns[column].name} = {values[row, column]:.6g} is outside "
                 f"[{low[row, column]:.6g}, {high[row, column]:.6g}]"
             )
+
+
+def _require_alone(robot: DdsLink, kind: type[HardwareLost] | type[SafetyStop]) -> None:
+    if others := robot.other_writers():
+        raise kind(
+            f"another program publishes {COMMAND_TOPIC}: {', '.join(others)}. The motors would follow both",
+            hint="end that program, or switch the robot's motion service off: in the app, or with MotionSwitcher",
+        )
 
 
 def legs(port: str, ids: Sequence[int], drive: Any, *, baud_rate: int, silence_s: float) -> UnitreeLegs:

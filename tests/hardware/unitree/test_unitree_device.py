@@ -16,7 +16,7 @@ from sim2real.emulation.virtual_legs import VirtualLegs
 from sim2real.errors import HardwareLost, SafetyStop, UsageError
 from sim2real.hardware.device import Alone
 from sim2real.hardware.registry import load_device
-from sim2real.hardware.unitree import guarded, legs
+from sim2real.hardware.unitree import legs
 from sim2real.hardware.unitree.dds import Address, connect
 from sim2real.hardware.unitree.device import UnitreeLegs
 from sim2real.hardware.unitree.legs import LegDrive
@@ -122,7 +122,7 @@ def stand(link):
 
 
 def test_another_program_is_refused_and_its_robot_stands_on(robot, device, other, monkeypatch):
-    monkeypatch.setattr(guarded, "LEASE_S", -0.5)
+    monkeypatch.setattr("sim2real.hardware.unitree.device.LEASE_S", -0.5)
     stand(other)
     with pytest.raises(HardwareLost, match="another program publishes rt/lowcmd: another program"):
         device.open()
