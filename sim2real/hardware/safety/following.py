@@ -28,6 +28,7 @@ _ENOUGH: Final = 1.0
 """Sum of the squares of a joint's changes of speed from which on they tell, against noise of 0.05 rad/s [rad^2/s^2]."""
 
 Push: TypeAlias = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
+Speed: TypeAlias = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,8 @@ class Following:
         most_nm: Torque that each motor reaches, one value or one per joint; None: goals are compared.
         push: Returns for positions, velocities and commands ``(n,)`` the acceleration of each joint without its
             command, that by its command, and the largest one by dry friction [rad/s^2].
+        speeds: Returns for positions ``(n,)`` the speed of each joint towards smaller and towards larger angles, in
+            place of ``speed_rad_s`` [rad/s].
         delay_s: Time from a command to the measurement that shows it, for pushes [s].
     """
 
@@ -63,6 +66,7 @@ class Following:
     weight: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None
     most_nm: float | Sequence[float] | np.ndarray | None = None
     push: Push | None = None
+    speeds: Speed | None = None
     delay_s: float = 0.0
 
     @property
@@ -83,7 +87,8 @@ class FollowingCheck:
     def __init__(self, following: Following, start: np.ndarray, t_s: float, name: Callable[[int], str]) -> None:
         self._following, self._name, n = following, name, len(start)
         self._limit = np.broadcast_to(np.asarray(following.limit, np.float64), n)
-        self._speed = np.broadcast_to(np.asarray(following.speed_rad_s, np.float64), n)
+        both = np.broadcast_to(np.asarray(following.speed_rad_s, np.float64), n)
+        self._speeds = following.speeds or (lambda _: (both, both))
         self._lock = threading.Lock()
         self._commands: list[tuple[float, np.ndarray]] = [(t_s, np.array(start, np.float64))]
         self._low = self._high = self._commands[0][1]
@@ -131,9 +136,9 @@ class FollowingCheck:
     def _distance(self, goals: np.ndarray, position_rad: np.ndarray, elapsed_s: float) -> np.ndarray:
         """Return the distance of each joint from where its goals put it [rad]."""
         # A joint that is on its way to its goals goes on from where it was measured last.
-        way = self._speed * elapsed_s
-        self._low = np.minimum(goals.min(axis=0), np.maximum(self._low, self._position) + way)
-        self._high = np.maximum(goals.max(axis=0), np.minimum(self._high, self._position) - way)
+        downwards, upwards = self._speeds(self._position)
+        self._low = np.minimum(goals.min(axis=0), np.maximum(self._low, self._position) + upwards * elapsed_s)
+        self._high = np.maximum(goals.max(axis=0), np.minimum(self._high, self._position) - downwards * elapsed_s)
         self._position = position_rad
         low, high = self._low, self._high
         if self._following.weight is not None:

@@ -47,7 +47,7 @@ _NEVER = 1e9
 LIMIT_RAD: Final = 0.15
 """Largest distance of a joint from where goals, weight and friction put it [rad]. In sound deployments with any payload
 up to the heaviest it was 0.11 rad."""
-_POSES, _SHARE, _LEAST_RAD_S = 200, 0.5, 0.1
+_SHARE, _LEAST_RAD_S = 0.5, 0.1
 """Poses in which the weight is taken; share of the free speed, and least speed [rad/s], of a joint on its way."""
 _MOST_OFFSET_RAD = 0.05
 _SOON, _STOPS = [1e-4, 1.0], [0.995, 0.995, 0.001, 0.5, 2.0]
@@ -391,9 +391,14 @@ def identified_following(mjcfs: Sequence[str], joints: Sequence[str]) -> Followi
             sinks.append(-data.qfrc_bias[dofs] / stiffness)
         return np.min(sinks, axis=0) - friction_rad, np.max(sinks, axis=0) + friction_rad
 
-    # On a longer way a joint has at least a share of the speed at which damping takes what weight and friction leave.
-    low, high = model.jnt_range[[int(model.joint(joint).id) for joint in joints]].T
-    poses = np.random.default_rng(0).uniform(low, high, (_POSES, len(joints)))
-    sinks_rad = np.max([np.abs(weight(pose)).max(axis=0) for pose in poses], axis=0)
-    speed = _SHARE * np.maximum(most_rad - sinks_rad, 0.0) * stiffness / np.maximum(model.dof_damping[dofs], 1e-9)
-    return Following(LIMIT_RAD, RESPONSE_S, np.clip(speed, _LEAST_RAD_S, None), "the identified model", weight)
+    damping = np.maximum(model.dof_damping[dofs], 1e-9)
+
+    def speeds(position_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        # On a longer way a joint has at least a share of the speed at which damping takes what weight and friction
+        # leave of its torque.
+        lowest, highest = weight(position_rad)
+        left = most_rad - np.maximum(highest, 0.0), most_rad + np.minimum(lowest, 0.0)
+        downwards, upwards = (np.clip(_SHARE * rad * stiffness / damping, _LEAST_RAD_S, None) for rad in left)
+        return downwards, upwards
+
+    return Following(LIMIT_RAD, RESPONSE_S, source="the identified model", weight=weight, speeds=speeds)
