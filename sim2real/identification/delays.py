@@ -305,12 +305,19 @@ def _arrived(linearise: Linearise, x: np.ndarray, delay_s: float) -> Delays:
     ends = []
     for (_, likelihood, p), at in (first, (local(best), x)):
         for _ in range(_AGAIN):
-            at, noise, share = at + p[: len(x)], likelihood.noise(p), likelihood.shares(p)
-            likelihood = Likelihood(linearise(at, float(share @ likelihood.grid)), likelihood.grid)
-            p = likelihood.maximise(likelihood.start(noise, share))
+            begin, share = likelihood.start(likelihood.noise(p), likelihood.shares(p)), likelihood.shares(p)
+            # Take a step in part if it lowers the likelihood: where a joint sticks, its first velocity hardly changes
+            # the motion to first order, and the linearised model moves it too far.
+            for part in _PARTS:
+                there = at + part * p[: len(x)]
+                new = Likelihood(linearise(there, float(share @ likelihood.grid)), likelihood.grid)
+                if new(begin)[0] > likelihood(begin)[0]:
+                    likelihood, at = new, there
+                    break
+            p = likelihood.maximise(begin)
         ends.append((likelihood(p)[0], likelihood, p, at))
     _, likelihood, p, at = max(ends, key=lambda end: end[0])
-    x, noise, share, grid = at + p[: len(x)], likelihood.noise(p), likelihood.shares(p), likelihood.grid
+    x, noise, share, grid = at, likelihood.noise(p), likelihood.shares(p), likelihood.grid
     mean_s = float(share @ grid)
     # Errors of the estimate.
     deviation_s = float(np.sqrt(share @ (grid - mean_s) ** 2))
