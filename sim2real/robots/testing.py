@@ -112,7 +112,8 @@ def check_simulation(robot: Robot) -> None:
     outputs = {name: _ran(records[name]) for name in recorded}
     fields = {field for row in robot.sensor.joints.values() for field in row.values()}
     measured = as_columns(outputs[SENSOR])
-    _include(measured, fields, "fields of joints")
+    # The column of a vector with one entry has no index.
+    _include({*measured, *(f"{name}[0]" for name in measured)}, fields, "fields of joints")
     _include(outputs[ACTUATOR], {robot.drive.command}, "fields of a command")
     _include(robot.units, {*outputs[SENSOR], robot.drive.command}, "units")
     command, actions = outputs[ACTUATOR][robot.drive.command], len(robot.agent.action)

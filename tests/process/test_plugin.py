@@ -25,7 +25,7 @@ from pathlib import Path
 import sim2real
 
 turntable = sim2real.load_robot("turntable")
-brief = replace(turntable.identify, settle_s=0.2, horizon_s=0.4, folds=0, free_run_s=0.0)
+brief = replace(turntable.defaults.identify, settle_s=0.2, horizon_s=0.4, folds=0, free_run_s=0.0)
 tiny = replace(brief, generations=0, refine_steps=3)
 recording = sim2real.Recording.load(Path({log!r}))
 found = sim2real.identify(turntable, recording, replace(tiny, world="oiled", fix={{"drag": 0.0}}))
