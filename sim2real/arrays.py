@@ -32,3 +32,26 @@ def beside_damping(armature: Scalar, damping: Scalar, step_s: Scalar) -> Any:
     6 % of the rotors' inertia of pipelines/arm, and 0.0018 kg m^2 for a damping of 1.4 N m s/rad.
     """
     return namespace(armature, damping).maximum(armature - 0.5 * step_s * damping, 0.0)
+
+
+def multiply_quaternions(a: Any, b: Any) -> Any:
+    """Return the product of two quaternions ``(4,)``, scalar first: first rotate by b, then by a."""
+    xp = namespace(a, b)
+    w1, x1, y1, z1 = (a[i] for i in range(4))
+    w2, x2, y2, z2 = (b[i] for i in range(4))
+    return xp.stack(
+        [
+            w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
+            w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
+            w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
+            w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
+        ]
+    )
+
+
+def rotate(vector: Any, quaternion: Any) -> Any:
+    """Return a vector ``(3,)`` rotated by a unit quaternion ``(4,)``, scalar first."""
+    xp = namespace(vector, quaternion)
+    w, axis = quaternion[0], quaternion[1:]
+    turn = 2.0 * xp.cross(axis, vector)
+    return vector + w * turn + xp.cross(axis, turn)

@@ -8,12 +8,12 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
+from sim2real.arrays import multiply_quaternions, namespace, rotate
 from sim2real.composer.errors import NotAttachedError
 from sim2real.composer.mjcf import RootElement as Model
 from sim2real.composer.mjcf import get_attachment_frame, get_frame_freejoint
 from sim2real.composer.mjcf.element import Element
 from sim2real.composer.observables import Observables
-from sim2real.composer.physics.arrays import multiply_quaternions, namespace, rotate
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:

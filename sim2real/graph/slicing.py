@@ -27,8 +27,3 @@ def tree_dynamic_slice(tree: T, start_indices: jax.Array) -> T:
         return jax.lax.dynamic_slice(leaf, starts, (1,) * n + leaf.shape[n:])
 
     return jax.tree_util.tree_map(one, tree)
-
-
-def strong(tree: T) -> T:
-    """Return the tree without JAX's weak types, which would change the type of a scan's carry."""
-    return jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf, dtype=jnp.result_type(leaf)), tree)

@@ -16,12 +16,11 @@ from sim2real.graph.schedule import draw
 from sim2real.graph.timeline import Timeline
 from sim2real.graph.windows import check_bursts
 from sim2real.runtime.clock import Clock, MonotonicClock
-from sim2real.runtime.data import NodeData
 from sim2real.runtime.failure import noted
 from sim2real.runtime.init import collect, init_graph_state, key_numbers
 from sim2real.runtime.simulated import SimulatedRun
 from sim2real.runtime.statistics import NodeStatistics
-from sim2real.runtime.stepper import Reply, Stepper
+from sim2real.runtime.steps import NodeData, Reply, Stepper
 from sim2real.runtime.wall_clock import WallClockRun
 from sim2real.types import Key, PyTree
 

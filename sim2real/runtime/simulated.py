@@ -17,10 +17,9 @@ from sim2real.graph.rules import at_delay, next_drift, slot
 from sim2real.graph.schedule import topological
 from sim2real.graph.timeline import Timeline
 from sim2real.graph.times import Edge
-from sim2real.runtime.data import Message, NodeData, snapshot
 from sim2real.runtime.failure import GraphTimeout, named
 from sim2real.runtime.statistics import NodeStatistics, StepLog
-from sim2real.runtime.stepper import Reply, Result, Stepper, overwritten
+from sim2real.runtime.steps import Message, NodeData, Reply, Result, Stepper, overwritten, snapshot
 
 _NEVER = 2**62
 

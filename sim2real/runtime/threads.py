@@ -13,10 +13,9 @@ from sim2real.graph.episode import MessageRecord, Recorder, StepRecord
 from sim2real.graph.node import Connection, phase_ticks
 from sim2real.graph.rules import eligible, next_drift, quota, slot, start, waits_for_schedule
 from sim2real.runtime.clock import MonotonicClock
-from sim2real.runtime.data import Message, NodeData
 from sim2real.runtime.failure import GraphTimeout, Stopped, named
 from sim2real.runtime.statistics import StepLog
-from sim2real.runtime.stepper import Reply, Result, Stepper, overwritten
+from sim2real.runtime.steps import Message, NodeData, Reply, Result, Stepper, overwritten
 
 _CHUNK = 1024
 

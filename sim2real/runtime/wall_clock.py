@@ -11,10 +11,9 @@ from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.episode import Recorder
 from sim2real.graph.node import TICKS_PER_S, BaseNode
 from sim2real.runtime.clock import MonotonicClock, realtime
-from sim2real.runtime.data import NodeData, snapshot
 from sim2real.runtime.failure import GraphTimeout
 from sim2real.runtime.statistics import NodeStatistics
-from sim2real.runtime.stepper import Reply, Stepper
+from sim2real.runtime.steps import NodeData, Reply, Stepper, snapshot
 from sim2real.runtime.threads import Handover, MessageChannel, NodeThread, Shared
 
 _LEAD_S = 0.005

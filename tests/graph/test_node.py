@@ -7,7 +7,7 @@ import pytest
 import sim2real.graph as base
 from sim2real.errors import UsageError
 from sim2real.graph import BaseNode, BaseWorld, Jitter, Scheduling
-from sim2real.graph.slicing import strong, tree_dynamic_slice
+from sim2real.graph.slicing import tree_dynamic_slice
 
 
 @pytest.mark.parametrize("rate", [0, -1, float("nan"), float("inf"), None, "10"])
@@ -92,4 +92,3 @@ def test_tree_helpers():
     out = tree_dynamic_slice(tree, jnp.array([1, 7]))
     assert out["a"].tolist() == [[5]]
     assert out["b"].shape == (1, 1, 2)
-    assert not strong({"x": 1.0})["x"].weak_type

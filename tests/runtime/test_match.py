@@ -12,8 +12,7 @@ from sim2real.graph.schedule import draw
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import Clock
 from sim2real.runtime.compiled.graph import CompiledGraph
-from sim2real.runtime.data import Format
-from sim2real.runtime.match import matched
+from sim2real.runtime.steps import Format, matched
 
 FLOAT, INT = jnp.float32(1.0), jnp.int32(1)
 

@@ -368,7 +368,7 @@ class _Writer:
         for element, called, hint in order:
             one = element
             if one.is_removed and called:
-                one = element._root.look_up(KINDS_OF[name], called)
+                one = element._root.look_up(schema.KEYED[name], called)
             places.append((None, hint) if one is None or one.is_removed else self._place(one, name, model))
         return places
 
@@ -388,9 +388,6 @@ class _Writer:
         width = 3 if name == "mpos" else 4
         number = mj.mj_name2id(model, mj.mjtObj.mjOBJ_BODY, called)
         return width * int(model.body_mocapid[number]), width
-
-
-KINDS_OF = {"qpos": "joint", "qvel": "joint", "act": "actuator", "ctrl": "actuator", "mpos": "body", "mquat": "body"}
 
 
 def _same(order: list[Any], now: list[Any]) -> bool:

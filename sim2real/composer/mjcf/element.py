@@ -207,7 +207,7 @@ class Element:
                 self._key_order.pop(name, None)
             return
         values[name] = self._converted(name, value)
-        if self._tag == "key" and name in KEYED:
+        if self._tag == "key" and name in schema.KEYED:
             self._key_order[name] = self._root.keyed_elements(name)
 
     def _converted(self, name: str, value: Any) -> Any:
@@ -527,10 +527,6 @@ def _public(name: str) -> str:
 def _types_first(name: str) -> bool:
     """Sort attributes that say what others name before those."""
     return not name.endswith("type")
-
-
-KEYED = {"qpos": "joint", "qvel": "joint", "act": "actuator", "ctrl": "actuator", "mpos": "body", "mquat": "body"}
-"""Attribute of a keyframe -> the kind of element that its numbers belong to."""
 
 
 def bytes_of(text: str) -> int:

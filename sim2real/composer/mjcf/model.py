@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from sim2real.composer.mjcf import compose, schema
-from sim2real.composer.mjcf.element import KEYED, Element, bytes_of
+from sim2real.composer.mjcf.element import Element, bytes_of
 from sim2real.composer.mjcf.files import NoSuchFileError
 from sim2real.errors import UsageError
 
@@ -160,10 +160,6 @@ class RootElement(Element):
     def full_identifier(self) -> str:
         """The prefix of all names in this model once it is compiled: ``''`` at the top, else ``arm/hand/``."""
         return self.prefix(self.root_model)
-
-    def attached_models(self) -> list[RootElement]:
-        """Return the models that are attached to this one, in the order of attachment."""
-        return list(self.frames)
 
     def all_models(self) -> Iterator[RootElement]:
         """Yield this model and all attached to it, depth first."""
@@ -315,8 +311,8 @@ class RootElement(Element):
 
     def keyed_elements(self, name: str) -> list[Any]:
         """Return the elements that the numbers of a keyframe's attribute belong to, with their names and widths."""
-        elements = self.find_all(KEYED[name], exclude_attachments=True)
-        if KEYED[name] == "body":
+        elements = self.find_all(schema.KEYED[name], exclude_attachments=True)
+        if schema.KEYED[name] == "body":
             elements = [e for e in elements if e._given.get("mocap") == "true"]
         return [(e, e._given.get("name"), compose.width_of(e, name)) for e in elements]
 
@@ -428,7 +424,7 @@ def _from_node(
     if resolves:
         model.resolve_references()
     for key in model._child("keyframe")._children:
-        for name in KEYED.keys() & key._given.keys():
+        for name in schema.KEYED.keys() & key._given.keys():
             key._key_order[name] = model.keyed_elements(name)
     return model
 

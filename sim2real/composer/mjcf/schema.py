@@ -220,6 +220,8 @@ def reference(path: str, tag: str, name: str) -> str | None:
     return _REFERENCES.get(name)
 
 
+KEYED = {"qpos": "joint", "qvel": "joint", "act": "actuator", "ctrl": "actuator", "mpos": "body", "mquat": "body"}
+"""Attribute of a keyframe -> the kind of element that its numbers belong to."""
 KIND_OF_TAG = {
     "freejoint": "joint",
     **{tag: "actuator" for tag in ("general", "motor", "position", "velocity", "intvelocity", "damper", "cylinder",

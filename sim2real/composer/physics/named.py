@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
+from sim2real.arrays import is_jax
 from sim2real.composer.mjcf.element import Element
 from sim2real.composer.physics import layout
-from sim2real.composer.physics.arrays import is_jax
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeGuard
 
 import numpy as np
 
-from sim2real.composer.physics.arrays import is_jax, namespace
+from sim2real.arrays import is_jax, namespace
 
 if TYPE_CHECKING:
     from sim2real.composer.types import ArrayLike, CarriedRandomState, Index, RandomState, Varying

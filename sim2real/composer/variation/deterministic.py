@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from sim2real.composer.physics.arrays import namespace
+from sim2real.arrays import namespace
 from sim2real.composer.variation.base import Context, ContextVariation, Parametric, evaluate, is_compiled
 
 if TYPE_CHECKING:

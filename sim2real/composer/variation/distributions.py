@@ -7,7 +7,7 @@ import math
 from abc import abstractmethod
 from typing import TYPE_CHECKING
 
-from sim2real.composer.physics.arrays import namespace
+from sim2real.arrays import namespace
 from sim2real.composer.variation.base import Context, ContextVariation, Parametric, evaluate, is_compiled
 from sim2real.errors import UsageError
 

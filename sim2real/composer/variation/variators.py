@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 
 import numpy as np
 
-from sim2real.composer.physics.arrays import is_jax
+from sim2real.arrays import is_jax
 from sim2real.composer.variation.base import evaluate
 
 if TYPE_CHECKING:

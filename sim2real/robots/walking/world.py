@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from sim2real.composer.physics.mjx.warp import warp_fields
+from sim2real.composer.physics.mjx import stepping
 from sim2real.graph.base import GraphState
 from sim2real.robots.loop import ACTUATOR, WORLD
 from sim2real.robots.walking.messages import BodyReading
@@ -51,8 +51,8 @@ class WalkingWorld(ComposedWorld):
         base = model.body(task.base.full_identifier).id
         kilograms = np.linspace(*loads, _ROWS)
         rows = [load_base(model, base, load) for load in kilograms]
-        on_warp = warp_fields.is_warp(self.environment.mjx_model)
-        names = [n for n in _LOADED_FIELDS if not on_warp or warp_fields.varies(n)]
+        on_warp = stepping.is_warp(self.environment.mjx_model)
+        names = [n for n in _LOADED_FIELDS if not on_warp or stepping.varies(n)]
         self._table = {n: (kilograms, np.stack([getattr(row, n) for row in rows])) for n in names}
         actuated = [model.joint(j.full_identifier) for j in task.joints]
         self._qpos = jnp.array([int(j.qposadr[0]) for j in actuated])

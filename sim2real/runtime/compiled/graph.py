@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol, TypeVar, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -22,11 +22,37 @@ from sim2real.graph.timeline import Timeline
 from sim2real.runtime.compiled.rows import Rollout, RowProgram, scan_rows, select
 from sim2real.runtime.compiled.wiring import Wiring, check_fit, nodes_of, supervisor_of, wire
 from sim2real.runtime.init import OUTPUTS, init_graph_state
-from sim2real.runtime.program_arguments import data_of, with_data
 from sim2real.types import Json, PyTree
 
 if TYPE_CHECKING:
     from sim2real.graph.base import Number
+
+T = TypeVar("T")
+
+
+@runtime_checkable
+class HoldsData(Protocol):
+    """An object whose methods are traced, with numbers from a recording."""
+
+    @property
+    def data(self) -> PyTree:
+        """The numbers, a pytree of arrays. Its structure and shapes belong to the program."""
+        ...
+
+    def with_data(self, data: PyTree) -> PyTree:
+        """Return a copy of this object with other numbers, which may be traced."""
+        ...
+
+
+def data_of(holder: object) -> PyTree:
+    """Return an object's data; None if it is no ``HoldsData``."""
+    return holder.data if isinstance(holder, HoldsData) else None
+
+
+def with_data(holder: T, data: PyTree) -> T:
+    """Return a copy of an object with other data; the object unchanged if ``data`` is None."""
+    changed: PyTree = holder.with_data(data) if data is not None and isinstance(holder, HoldsData) else holder
+    return changed
 
 
 class CompiledGraph:

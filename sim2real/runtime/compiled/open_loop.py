@@ -20,7 +20,7 @@ from sim2real.graph.timeline import Timeline
 from sim2real.graph.windows import check_bursts, newest_message
 from sim2real.runtime.compiled.wiring import check_fit, messages_read
 from sim2real.runtime.init import OUTPUTS, init_graph_state
-from sim2real.runtime.match import matched
+from sim2real.runtime.steps import matched
 from sim2real.types import PyTree
 
 Tables = dict[str, PyTree]

@@ -14,7 +14,7 @@ from sim2real.graph.base import GraphState, InputState, StepState
 from sim2real.graph.node import BaseNode
 from sim2real.runtime.compiled.wiring import SlotTable, Wiring
 from sim2real.runtime.init import DelayBounds, bounds_of
-from sim2real.runtime.match import matched
+from sim2real.runtime.steps import matched
 from sim2real.types import PyTree
 
 if TYPE_CHECKING:

@@ -11,8 +11,7 @@ import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, StepState
-from sim2real.runtime.compiled.graph import CompiledGraph
-from sim2real.runtime.program_arguments import data_of, with_data
+from sim2real.runtime.compiled.graph import CompiledGraph, data_of, with_data
 from sim2real.training.environment.protocol import Step, TrainingEnvironment
 from sim2real.training.environment.pushes import Pushes
 from sim2real.training.environment.tasks import REWARD, Rewards, TrainingTask, checked_end, terms_of, total_of

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.runtime.program_arguments import data_of, with_data
+from sim2real.runtime.compiled.graph import data_of, with_data
 from sim2real.training.config import PPOConfig as PPOConfig
 from sim2real.training.environment.protocol import (
     TrainingEnvironment,

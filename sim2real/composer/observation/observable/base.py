@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from dm_env import specs
 
+from sim2real.arrays import namespace
 from sim2real.composer.mjcf.element import Element, as_elements
-from sim2real.composer.physics.arrays import namespace
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
 
+from sim2real.arrays import multiply_quaternions, rotate
 from sim2real.composer.mjcf.schema import mj
-from sim2real.composer.physics.arrays import multiply_quaternions, rotate
 from sim2real.composer.physics.mjx.import_mjx import held_links
-from sim2real.composer.physics.mjx.warp.warp_fields import is_warp, varies
+from sim2real.composer.physics.mjx.stepping import is_warp, varies
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:

@@ -16,7 +16,6 @@ from sim2real.composer.physics import layout
 from sim2real.composer.physics.base import BaseBinding, BaseModelView, BasePhysics
 from sim2real.composer.physics.mjx import constants, stepping
 from sim2real.composer.physics.mjx.random import JaxRandomState
-from sim2real.composer.physics.mjx.warp import warp_fields
 from sim2real.composer.physics.named import Named
 from sim2real.errors import UsageError
 from sim2real.types import PyTree
@@ -130,7 +129,7 @@ class MjxPhysics(BasePhysics):
         Raises:
             UsageError: With the field.
         """
-        if struct != "model" or warp_fields.is_warp(self.mjx_model):
+        if struct != "model" or stepping.is_warp(self.mjx_model):
             return
         if name.endswith("_frictionloss") and not np.all(np.asarray(getattr(self.host, name))[rows] > 0):
             raise UsageError(
@@ -153,8 +152,8 @@ class MjxPhysics(BasePhysics):
         current = _get(holder, name)
         if not isinstance(current, jax.Array):
             raise constant(name)
-        if struct == "model" and warp_fields.is_warp(self.mjx_model):
-            warp_fields.check_field(name)
+        if struct == "model" and stepping.is_warp(self.mjx_model):
+            stepping.check_field(name)
         try:
             value = jnp.broadcast_to(jnp.asarray(value, current.dtype), current.shape)
         except ValueError:
@@ -168,7 +167,7 @@ class MjxPhysics(BasePhysics):
 
     def switch_on(self) -> None:
         """Have programs compute what follows from fields that hooks set, though they were 0 in the compiled model."""
-        on_warp = warp_fields.is_warp(self.mjx_model)
+        on_warp = stepping.is_warp(self.mjx_model)
         switches: dict[str, str] = _WARP_SWITCHES if on_warp else _SWITCHES
         for path in {switches[name] for name in self.changed if name in switches}:
             if not _get(self.mjx_model, path):

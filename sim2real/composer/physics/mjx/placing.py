@@ -11,7 +11,7 @@ from mujoco import mjx
 from sim2real.composer.physics.mjx.import_mjx import held_links
 from sim2real.composer.physics.mjx.physics import MjxPhysics
 from sim2real.composer.physics.mjx.random import JaxRandomState
-from sim2real.composer.physics.mjx.warp.warp_fields import is_warp
+from sim2real.composer.physics.mjx.stepping import is_warp
 from sim2real.composer.variation.base import evaluate
 from sim2real.errors import UsageError
 

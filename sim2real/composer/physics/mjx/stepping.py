@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from mujoco import mjx
 
 from sim2real.composer.physics.mjx.import_mjx import held_links
+from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
     from sim2real.types import PyTree
@@ -23,6 +24,27 @@ T = TypeVar("T", mjx.Model, mjx.Data)
 def with_fields(tree: T, values: dict[str, PyTree]) -> T:
     """Return a model or a state with other values of some fields, by their paths, such as ``opt.gravity``."""
     return cast("T", tree.tree_replace(values))
+
+
+def varies(path: str) -> bool:
+    """Return whether a field of the model, such as ``body_mass`` or ``opt.gravity``, may differ from copy to copy."""
+    from mujoco.mjx.warp import types
+
+    return bool(types._BATCH_DIM["Model"].get(path.replace(".", "__")))
+
+
+def check_field(path: str) -> None:
+    """Refuse a field of the model that cannot differ from copy to copy; UsageError with the field."""
+    if not varies(path):
+        raise UsageError(
+            f"MJX-Warp cannot change {path!r}: it is the same in all copies",
+            hint='set it in the model before it is compiled, or use impl="jax"',
+        )
+
+
+def is_warp(model: mjx.Model) -> bool:
+    """Return whether an ``mjx.Model`` is MuJoCo Warp's."""
+    return model.impl == mjx.Impl.WARP
 
 
 class Engine(Protocol):

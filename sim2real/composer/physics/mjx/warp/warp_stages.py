@@ -24,7 +24,7 @@ from mujoco.mjx.warp import ffi
 from mujoco.mjx.warp import forward as generated
 
 from sim2real.composer.mjcf.schema import mj
-from sim2real.composer.physics.mjx.warp.warp_fields import varies
+from sim2real.composer.physics.mjx.stepping import varies
 
 if TYPE_CHECKING:
     from mujoco import mjx
