@@ -225,18 +225,20 @@ def test_a_step_is_that_of_mj_step_with_all_sensors(double, integrator):
 
 
 def test_the_state_at_the_start_of_an_episode_is_that_of_c(double):
-    """MJX normalizes quaternions that a hook left otherwise, and has velocities of actuators that are switched off."""
+    """MJX normalizes quaternions that a hook left, and has velocities and forces of actuators that are switched off."""
     model = mujoco.MjModel.from_xml_string(
         """<mujoco><worldbody><body><joint name="j" type="ball"/><geom size=".1"/></body></worldbody>
         <actuator><velocity name="v" joint="j"/></actuator><sensor><actuatorvel actuator="v"/></sensor></mujoco>"""
     )
     data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[0] = [1.02, 0.02, 0.02, 0.02], 0.5
+    data.qpos[:], data.qvel[0], data.ctrl[:] = [1.02, 0.02, 0.02, 0.02], 0.5, 1.0
+    mujoco.mj_forward(model, data)  # as a hook that reads something has it computed
     given = mjx.put_model(model), mjx.put_data(model, data)
     found = jax.jit(lambda m, d: ENGINE.forward(m, d, False))(*given)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
     mujoco.mj_forward(model, data)
     assert found.sensordata[0] == data.sensordata[0]
+    assert found.actuator_force[0] == data.actuator_force[0] == 0.0
     np.testing.assert_array_equal(found.qpos, data.qpos)
 
 

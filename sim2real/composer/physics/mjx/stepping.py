@@ -115,7 +115,10 @@ def _positions(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 @held_links()
 def _react(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Compute forces and accelerations from what follows from positions and velocities."""
-    data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
+    data = mjx.fwd_actuation(model, data)
+    if model.opt.disableflags & mjx.DisableBit.ACTUATION:  # MJX leaves what an earlier step computed
+        data = data.replace(actuator_force=jnp.zeros_like(data.actuator_force))
+    data = mjx.fwd_acceleration(model, data)
     impl: PyTree = data._impl
     data = data.replace(qacc=data.qacc_smooth) if impl.efc_J.size == 0 else mjx.solve(model, data)
     return mjx.sensor_acc(model, data)
