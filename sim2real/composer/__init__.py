@@ -33,7 +33,7 @@ from sim2real.composer.task import Task as Task
 from sim2real.composer.variation.base import Variation as Variation
 
 if TYPE_CHECKING:
-    from sim2real.composer.physics.mjx.environment import MjxEnvironment as MjxEnvironment
+    from sim2real.composer.mjx_environment import MjxEnvironment as MjxEnvironment
     from sim2real.interop.brax import BraxEnv as BraxEnv
     from sim2real.interop.vector import CopiesVectorEnv
     from sim2real.worlds.composed import ComposedWorld as ComposedWorld
@@ -44,7 +44,7 @@ Model = RootElement
 _LAZY = {
     "BraxEnv": ("sim2real.interop.brax", "BraxEnv"),
     "ComposedWorld": ("sim2real.worlds.composed", "ComposedWorld"),
-    "MjxEnvironment": ("sim2real.composer.physics.mjx.environment", "MjxEnvironment"),
+    "MjxEnvironment": ("sim2real.composer.mjx_environment", "MjxEnvironment"),
     "MjxVectorEnv": ("sim2real.interop.vector", "CopiesVectorEnv"),
 }
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sim2real.composer.physics.mjx.environment import MjxEnvironment, State
+from sim2real.composer.mjx_environment import MjxEnvironment, State
 from sim2real.errors import Sim2RealError
 from sim2real.installation import with_extra
 from sim2real.interop.robot import Copy, RobotEnvironment, specs_of

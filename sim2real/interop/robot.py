@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from dm_env import specs
 
-from sim2real.composer.physics.mjx.environment import MjxEnvironment
+from sim2real.composer.mjx_environment import MjxEnvironment
 from sim2real.errors import UsageError
 from sim2real.policy.contract import PolicyContract
 from sim2real.training.environment.graph_environment import EnvState, GraphEnvironment

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from dm_env import specs
 
-from sim2real.composer.physics.mjx.environment import MjxEnvironment, State
+from sim2real.composer.mjx_environment import MjxEnvironment, State
 from sim2real.composer.task import UNLIMITED
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.installation import with_extra

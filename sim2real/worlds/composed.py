@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 
 from sim2real import pytree
+from sim2real.composer.mjx_environment import MjxEnvironment, State
 from sim2real.composer.physics.mjx import constants
-from sim2real.composer.physics.mjx.environment import MjxEnvironment, State
 from sim2real.composer.physics.mjx.physics import MjxPhysics
 from sim2real.composer.task import Task
 from sim2real.composer.variation.variators import CONSTANTS

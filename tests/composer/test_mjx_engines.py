@@ -12,9 +12,9 @@ from mujoco import mjx
 
 from sim2real import composer
 from sim2real.composer import mjcf
+from sim2real.composer.mjx_environment import is_unstable
 from sim2real.composer.observation.observable import Generic, MJCFFeature
 from sim2real.composer.physics.mjx import constants, stepping
-from sim2real.composer.physics.mjx.environment import is_unstable
 from sim2real.composer.variation import PhysicsVariator, deterministic
 
 ENGINE = stepping.JaxEngine()

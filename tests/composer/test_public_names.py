@@ -18,7 +18,7 @@ NAMES = {
         "export_with_assets", "export_with_assets_as_zip", "from_file", "from_path", "from_xml_string",
         "get_attachment_frame", "get_frame_freejoint", "get_frame_joints", "get_freejoint",
     ],
-    "composer.physics.mjx": ["JaxRandomState", "MjxEnvironment", "MjxPhysics", "State"],
+    "composer.physics.mjx": ["JaxRandomState", "MjxPhysics"],
     "composer.observation": [
         "DEFAULT_BUFFER_SIZE", "DEFAULT_DELAY", "DEFAULT_UPDATE_INTERVAL", "Updater", "observable",
     ],

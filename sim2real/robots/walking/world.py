@@ -18,7 +18,7 @@ from sim2real.robots.walking.scene import Ground
 from sim2real.worlds.composed import ComposedWorld, WorldParams
 
 if TYPE_CHECKING:
-    from sim2real.composer.physics.mjx.environment import State
+    from sim2real.composer.mjx_environment import State
     from sim2real.composer.physics.mjx.physics import MjxPhysics
 
 mj: Any = mujoco

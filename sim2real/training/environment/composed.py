@@ -8,14 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sim2real.composer.physics.mjx.environment import MjxEnvironment
+from sim2real.composer.mjx_environment import MjxEnvironment
 from sim2real.composer.task import UNLIMITED
 from sim2real.errors import UsageError
 from sim2real.training.environment.protocol import Step, TrainingEnvironment
 from sim2real.training.environment.tasks import REWARD
 
 if TYPE_CHECKING:
-    from sim2real.composer.physics.mjx.environment import State
+    from sim2real.composer.mjx_environment import State
 
 
 class TaskState(NamedTuple):

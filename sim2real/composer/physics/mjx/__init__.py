@@ -3,7 +3,5 @@
 from sim2real.composer.physics.mjx.import_mjx import mjx as mjx  # first: the modules below import it themselves
 
 # isort: split
-from sim2real.composer.physics.mjx.environment import MjxEnvironment as MjxEnvironment
-from sim2real.composer.physics.mjx.environment import State as State
 from sim2real.composer.physics.mjx.physics import MjxPhysics as MjxPhysics
 from sim2real.composer.physics.mjx.random import JaxRandomState as JaxRandomState

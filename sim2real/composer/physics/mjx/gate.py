@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from mujoco import mjx
 
 from sim2real.composer.mjcf.schema import mj
-from sim2real.composer.observation.observable.base import MJCFCamera, MujocoCamera, Observable
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
@@ -68,13 +66,3 @@ def settle_cone(model: MjModel) -> None:
             hint='give them condim 3, or set option cone to "pyramidal"',
         )
     model.opt.cone = mj.mjtCone.mjCONE_ELLIPTIC
-
-
-def check_observables(observables: Mapping[str, Observable]) -> None:
-    """Refuse enabled observables that cannot be computed inside a compiled program."""
-    cameras = [k for k, o in observables.items() if o.enabled and isinstance(o, MJCFCamera | MujocoCamera)]
-    if cameras:
-        raise UsageError(
-            f"MJX renders no images: camera observables {', '.join(map(repr, cameras))}",
-            hint="disable them, or use the C engine",
-        )

@@ -5,25 +5,26 @@ from __future__ import annotations
 import functools
 import math
 import weakref
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from mujoco import mjx
 
 from sim2real import pytree
 from sim2real.composer.environment import ObservationPadding
 from sim2real.composer.mjcf.schema import mj
+from sim2real.composer.observation.observable.base import MujocoCamera, Observable
+from sim2real.composer.observation.rings import Ring, Samples
 from sim2real.composer.physics.c.physics import Physics
 from sim2real.composer.physics.mjx import gate
+from sim2real.composer.physics.mjx.import_mjx import mjx
 from sim2real.composer.physics.mjx.physics import MjxPhysics, freeze
 from sim2real.composer.physics.mjx.random import JaxRandomState, Registry
-from sim2real.composer.physics.mjx.rings import Ring, Samples
-from sim2real.composer.physics.mjx.tracing import TracedHooks, check_variables
 from sim2real.composer.physics.mjx.warp import warp
 from sim2real.composer.task import Task, count_steps, split_reward
+from sim2real.composer.traced_hooks import TracedHooks, check_variables
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
@@ -131,7 +132,7 @@ class MjxEnvironment:
         self._look_at_compiled(random_state)
         # Refuse unsupported options before anything is traced.
         observables = task.observables
-        gate.check_observables(observables)
+        _check_observables(observables)
         gate.check_model(self.model)
         self._warp = warp.make_engine(self.model, impl, nconmax, njmax)
         if self._warp is None:
@@ -369,3 +370,13 @@ def is_unstable(data: mjx.Data) -> jax.Array:
     """Return whether MuJoCo would warn of an instability: a value that is not finite, or beyond its ``mjMAXVAL``."""
     state = jnp.concatenate([data.qpos, data.qvel, data.qacc])
     return ~(jnp.abs(state) <= mj.mjMAXVAL).all()
+
+
+def _check_observables(observables: Mapping[str, Observable]) -> None:
+    """Refuse enabled observables that cannot be computed inside a compiled program."""
+    cameras = [k for k, o in observables.items() if o.enabled and isinstance(o, MujocoCamera)]
+    if cameras:
+        raise UsageError(
+            f"MJX renders no images: camera observables {', '.join(map(repr, cameras))}",
+            hint="disable them, or use the C engine",
+        )
