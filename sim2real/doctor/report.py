@@ -42,9 +42,10 @@ def write_diagnosis(folder: Path, diagnosis: Diagnosis, log: Log, name: str) -> 
             blocks.append(_parting(figures["parting"]))
             names = sorted({n for f in own for n in f.numbers if n != "delay_s"})
             if own:
+                what = ", ".join(names) or "the delay"
                 blocks.append(ListBlock("Next", [
-                    f"`sim2real identify --mjcf ROBOT.xml --log LOG` estimates {', '.join(names) or 'the delay'} with "
-                    "intervals; train again on it, or repair the drive."]))  # fmt: skip
+                    "`sim2real new ROBOT --mjcf ROBOT.xml --log LOG`, then `sim2real identify ROBOT --log LOG`: it "
+                    f"estimates {what} with intervals. Train again on it, or repair the drive."]))  # fmt: skip
         drawn = _FIGURES[question](figures, log)
         sections.append(PageSection(question, title, lead, (), blocks, banner, drawn))
     notes = [NoteBlock(diagnosis.sentence)]

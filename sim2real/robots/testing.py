@@ -113,7 +113,7 @@ def check_simulation(robot: Robot) -> None:
     fields = {field for row in robot.sensor.joints.values() for field in row.values()}
     measured = as_columns(outputs[SENSOR])
     # The column of a vector with one entry has no index.
-    _include({*measured, *(f"{name}[0]" for name in measured)}, fields, "fields of joints")
+    _include(measured, {f if f in measured else f.removesuffix("[0]") for f in fields}, "fields of joints")
     _include(outputs[ACTUATOR], {robot.drive.command}, "fields of a command")
     _include(robot.units, {*outputs[SENSOR], robot.drive.command}, "units")
     command, actions = outputs[ACTUATOR][robot.drive.command], len(robot.agent.action)

@@ -498,7 +498,8 @@ class Servos(Device):
 
     def _find(self, joint: ServoJoint) -> None:
         """Find a joint's servo and its model; raise HardwareLost if it does not answer, or two have its id."""
-        servo_id, link, whose = joint.servo_id, self.link, f" (joint {joint.name!r})"
+        servo_id, link = joint.servo_id, self.link
+        whose = "" if joint.name == f"servo {servo_id}" else f" (joint {joint.name!r})"
         try:
             link.ping(servo_id)
         except HardwareLost as error:
