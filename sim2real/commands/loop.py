@@ -128,7 +128,7 @@ class _Iterating:
                 "a dry deployment moves nothing, so no iteration follows from it", hint="run without --deploy.dry-run"
             )
         refusal, rows = None, list[Iteration]()
-        plan = Plan(STAGES, ", ".join(STAGES)) if run_dir is None else self._plan(run_dir)
+        plan = Plan(STAGES, ", ".join(STAGES)) if run_dir is None else self._plan(run_dir, resumed=True)
         while plan.stages:
             refusal = None
             for stage in plan.stages:
@@ -148,8 +148,13 @@ class _Iterating:
         print(artifact_table(iterations_table(iterations(run_dir)).without("why")))
         return run_dir
 
-    def _plan(self, run_dir: Path) -> Plan:
-        """Return the plan that follows from the stages of a run."""
+    def _plan(self, run_dir: Path, resumed: bool = False) -> Plan:
+        """Return the plan that follows from the stages of a run.
+
+        Args:
+            resumed: Whether no plan has run yet: then stages may lack. After a plan has run, the deployment alone
+                decides, so that no stage runs more often than there are iterations.
+        """
         rows, status = iterations(run_dir), stage_status(run_dir)
         lacking = tuple(s for s in STAGES if s not in status or status[s].stale)
         if not rows:
@@ -160,7 +165,7 @@ class _Iterating:
         recorded = status["record"].newest.manifest.started if "record" in status else ""
         if last.refused and recorded < last.deployment.manifest.started:
             plan = self._anew(run_dir, STAGES, drift)
-        elif lacking:
+        elif lacking and resumed:
             # The run was interrupted, or a stage was made by hand. An identification from named logs may not suffice.
             known = status.get("identify")
             if lacking[0] == "train" and known is not None and (known.newest.manifest.config or {}).get("log"):

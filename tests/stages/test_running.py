@@ -166,3 +166,11 @@ def test_a_goal_goes_on_until_it_is_reached_or_the_iterations_end(world, capsys)
 def test_a_goal_that_is_none_is_refused_before_anything_moves(told, said):
     with pytest.raises(UsageError, match=said):
         RunFlags(**told)
+
+
+def test_a_deployment_that_does_not_say_what_it_took_is_not_repeated_for_ever(world, monkeypatch):
+    """Nothing says that it is current, so it counts as stale. Only the iterations bound how often a robot moves."""
+    monkeypatch.setattr("loop_stages.TAKES", {})
+    again, rows = world.go(*(verdict("re-identify") for _ in range(9)), iterations=2)
+    assert again == ["identify", "train", "deploy"]
+    assert len(rows) == 2
