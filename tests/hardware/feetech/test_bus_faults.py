@@ -52,7 +52,7 @@ def test_dynamixels_too(serve, open_servos):
     robot = serve("FirstOrder", EmulatorConfig(), ids=(1, 2))
     answer_twice(robot, 1, 4, one_after_the_other)
     open_servos(robot, (2,)).close()
-    with pytest.raises(HardwareLost, match=r"two servos on .* have the id 1 .*both answer, and both would obey"):
+    with pytest.raises(HardwareLost, match=r"two servos on .* have the id 1.*both answer, and both would obey"):
         open_servos(robot)
 
 
