@@ -65,6 +65,7 @@ def _bars(axis: Any, labels: Sequence[str], before: Sequence[float], after: Sequ
     axis.barh(at - 0.2, before, 0.38, color=INK, label="by the contract and the model")
     axis.barh(at + 0.2, after, 0.38, color=BLUE, label="with what was found")
     axis.set_yticks(at, labels)
+    axis.set_xlim(0.0, max(0.1, 1.05 * max([*before, *after], default=0.0)))  # rounding errors are no bars
     axis.invert_yaxis()
     axis.legend()
 
