@@ -10,7 +10,7 @@ from sim2real.commands import flags
 from sim2real.commands.stages import examples_of, summary_of
 from sim2real.errors import ERROR, UsageError
 from sim2real.stages.flag import Flag
-from sim2real.stages.terminal.console import note, wrote
+from sim2real.stages.terminal.console import note, progress, wrote
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,8 @@ def run(config: DoctorConfig) -> tuple[dict[str, Any], str, bool]:
         from sim2real.doctor.before import examine
 
         assert drives is not None
-        data = examine(policy, drives)
+        with progress(None, "let the policy act in the model"):
+            data = examine(policy, drives)
         return data, "\n".join([data["sentence"], *(f"- {line}" for line in data["lines"])]), not data["sound"]
 
     from sim2real.doctor.diagnosis import diagnose
@@ -81,7 +82,8 @@ def run(config: DoctorConfig) -> tuple[dict[str, Any], str, bool]:
     log = read_deployment(config.log, wanted, len(wanted), joints)
     sim = None if config.sim is None else read_deployment(config.sim, wanted, len(wanted), joints)
     note(f"{len(log.t)} steps of the policy in {log.t[-1] - log.t[0]:.1f} s")
-    found = diagnose(policy, log, drives, sim, joints)
+    with progress(None, "look for what is wrong"):
+        found = diagnose(policy, log, drives, sim, joints)
     page = write_diagnosis(config.out, found, log, config.policy.stem)
     (note if config.json else wrote)(str(page))
     lines = [found.sentence, *(f"- {f.question}: {f.text}; {f.share:.0%} of this gap" for f in found.findings),

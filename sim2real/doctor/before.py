@@ -121,7 +121,7 @@ def _run(policy: Policy, drives: Drives, plant: Plant, start: np.random.Generato
             q, dq, quats, gyros, actions = (np.array(column) for column in zip(*rows, strict=True))
             times = np.arange(len(rows)) / c.rate_hz
             # The newest row's own action does not exist yet: its last action is that of the row before.
-            log = Log(times, times, q, dq, quats, gyros, np.zeros((len(rows), 3)), None,
+            log = Log(times, times, q, dq, quats, gyros, np.zeros((len(rows), 3)),
                       np.zeros((len(rows), size)), None, np.roll(actions, -1, 0))  # fmt: skip
             deployed = Deployed(log, policy)
             action = policy(deployed.observations(Making(), np.array([len(rows) - 1])))[0]

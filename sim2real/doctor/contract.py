@@ -365,12 +365,18 @@ def _read_export(policy: Path) -> tuple[bytes, dict[str, Json]]:
 def _facts_of_metadata(data: Mapping[str, str]) -> dict[str, Json]:
     """Return the facts in the metadata that mjlab, Isaac Lab's motion tracking and their forks write into an ONNX."""
     facts: dict[str, Json] = {}
-    floats = lambda name: [float(v) for v in re.findall(r"-?\d+\.?\d*(?:e-?\d+)?", data[name])]  # noqa: E731
+
+    def floats(name: str) -> list[float]:
+        try:
+            return [float(v) for v in re.split(r"[\s,;\[\]()]+", data[name]) if v]
+        except ValueError:
+            raise UsageError(f"the metadata {name!r} of the ONNX file holds no numbers: {data[name][:60]}") from None
+
     if "joint_names" in data:
         facts["joints"] = data["joint_names"].split(",")
-    for ours, theirs in (("default_joint_pos", "default_joint_pos"), ("action_scale", "action_scale")):
-        if theirs in data and (numbers := floats(theirs)):
-            facts[ours] = numbers
+    for name in ("default_joint_pos", "action_scale"):
+        if name in data and (numbers := floats(name)):
+            facts[name] = numbers
     for ours, theirs in (("kp", "joint_stiffness"), ("kd", "joint_damping")):
         if theirs in data and (numbers := floats(theirs)):
             facts |= _gains(ours, numbers, theirs)

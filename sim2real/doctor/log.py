@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +28,7 @@ _NAMES = {
 }
 """Signal -> its names in a file, whose last part counts: ``sensor.position``."""
 _OF_NAME = {name: signal for signal, names in _NAMES.items() for name in names.split()}
-_STATES = ("q", "dq", "quat", "gyro", "lin_vel", "torque")
+_STATES = ("q", "dq", "quat", "gyro", "lin_vel")
 _UNUSED_NODES = ("world", "truth")
 
 
@@ -40,7 +40,7 @@ class Log:
         t: Times of the policy's steps ``(N,)`` [s].
         state_t: Times of the measurements ``(K,)`` [s].
         q, dq: Joints ``(K, J)``, in the contract's order [rad], [rad/s].
-        quat, gyro, lin_vel, torque: ``(K, 4)`` as w, x, y, z; ``(K, 3)`` [rad/s]; ``(K, 3)`` [m/s]; ``(K, J)`` [N m].
+        quat, gyro, lin_vel: ``(K, 4)`` as w, x, y, z; ``(K, 3)`` [rad/s]; ``(K, 3)`` [m/s].
         command: The task's command ``(N, C)``.
         obs: Observations before normalising ``(N, O)``.
         action: Outputs of the network ``(N, A)``.
@@ -55,7 +55,6 @@ class Log:
     quat: np.ndarray | None = None
     gyro: np.ndarray | None = None
     lin_vel: np.ndarray | None = None
-    torque: np.ndarray | None = None
     command: np.ndarray | None = None
     obs: np.ndarray | None = None
     action: np.ndarray | None = None
@@ -97,7 +96,7 @@ def read_deployment(path: Path, joints: Sequence[str], actions: int, robot_joint
         signal = _signal_of(name)
         if signal is not None and signal not in found:
             found[signal], times[signal] = np.asarray(values, float), stamps.get(name, np.zeros(0))
-            if signal in ("q", "dq", "target", "torque"):
+            if signal in ("q", "dq", "target"):
                 found[signal] = _in_order(found[signal], named.get(name, []) or robot_joints, joints, name)
     step_t = found.get("t")
     for name in ("action", "obs", "target"):
@@ -121,27 +120,38 @@ def read_deployment(path: Path, joints: Sequence[str], actions: int, robot_joint
     if "dq" not in found:
         found["dq"] = np.gradient(found["q"], state_t, axis=0)
     order = np.argsort(state_t, kind="stable")
-    states = {n: found[n][order] for n in _STATES if n in found and len(found[n]) == len(state_t)}
-    for name, values in states.items():
+    state_t = np.asarray(state_t)[order]
+    states, others = {}, {}
+    for name, values in found.items():
         if not np.isfinite(values).all():
             raise UsageError(f"{path}: {name} has values that are not finite")
-    others = {n: _at(found[n], times.get(n), step_t) for n in ("command", "obs", "action", "target") if n in found}
+        if name in _STATES:
+            own = len(values) == len(order)
+            states[name] = values[order] if own else _at(values, times[name], state_t, f"{path}: {name}")
+        elif name in ("command", "obs", "action", "target"):
+            others[name] = _at(values, times[name], step_t, f"{path}: {name}")
     if others.get("action") is not None and others["action"].shape[1] != actions:
         raise UsageError(f"{path}: action has {others['action'].shape[1]} columns, the policy {actions}")
-    return Log(step_t, np.asarray(state_t)[order], age_s=age_s, **states, **others)
+    return Log(step_t, state_t, age_s=age_s, **states, **others)
 
 
-def _at(values: np.ndarray, times: np.ndarray | None, step_t: np.ndarray) -> np.ndarray:
-    """Return a signal of the policy's loop at its steps."""
-    if len(values) == len(step_t):
+def _at(values: np.ndarray, times: np.ndarray, wanted: np.ndarray, what: str) -> np.ndarray:
+    """Return a signal at other times: the newest value then; a single row holds for all.
+
+    Raises:
+        UsageError: It has another number of rows, and no times of its own.
+    """
+    if len(values) == len(wanted):
         return values
-    if times is None or len(times) != len(values):
-        return np.broadcast_to(values[:1], (len(step_t), values.shape[1])).copy()
-    return values[np.clip(np.searchsorted(times, step_t + 1e-6, side="right") - 1, 0, len(values) - 1)]
+    if len(values) == 1:
+        return np.repeat(values, len(wanted), axis=0)
+    if len(times) != len(values):
+        raise UsageError(f"{what} has {len(values)} rows and no times of its own; {len(wanted)} rows are wanted")
+    return values[np.clip(np.searchsorted(times, wanted + 1e-6, side="right") - 1, 0, len(values) - 1)]
 
 
 def _signal_of(name: str) -> str | None:
-    """Return the signal of a name: a joint's angle is measured, or a target if the name is of a command."""
+    """Return the signal of a name; an angle or a torque of a command is a target, a measured torque is not used."""
     *nodes, last = re.split(r"[./]", name.lower())
     if nodes[:1] and nodes[0] in _UNUSED_NODES:
         return None
@@ -150,7 +160,7 @@ def _signal_of(name: str) -> str | None:
         return signal if signal in ("action", "obs", "command") else None
     if any(node == "actuator" or node.endswith("cmd") for node in nodes):
         return "target" if signal in ("q", "target", "action", "torque") else None
-    return signal
+    return None if signal == "torque" else signal
 
 
 def _in_order(values: np.ndarray, names: Sequence[str], joints: Sequence[str], signal: str) -> np.ndarray:
@@ -176,8 +186,10 @@ def _signals(
     from sim2real.log.importing.readers import open_tables
     from sim2real.log.writer import LIBRARY
 
-    if path.is_file() and path.read_bytes()[:200].find(LIBRARY.split()[0].encode()) >= 0:
-        return _own_log(path)
+    if path.is_file():
+        with path.open("rb") as file:
+            if LIBRARY.split()[0].encode() in file.read(200):
+                return _own_log(path)
     table = open_tables(path)[0]
     signals: dict[str, np.ndarray] = {}
     named: dict[str, list[str]] = {}
@@ -198,7 +210,7 @@ def _signals(
         del signals[name]
     for name, words in table.words.items():  # npz: joints = ["FL_hip_joint", ...]
         if name in ("joints", "joint_names"):
-            named |= {n: list(words) for n in signals if _signal_of(n) in ("q", "dq", "target", "torque")}
+            named |= {n: list(words) for n in signals if _signal_of(n) in ("q", "dq", "target")}
     return signals, {}, named, None
 
 
@@ -225,8 +237,3 @@ def _own_log(
             ok = used & (messages.seq_in < len(begun)) & (messages.seq_out < len(episode.steps[source]))
             age_s = begun[messages.seq_in[ok]] - episode.steps[source].begun_s[messages.seq_out[ok]]
     return signals, stamps, named, age_s
-
-
-def without(log: Log, *names: str) -> Log:
-    """Return a log that lacks some signals."""
-    return replace(log, **dict.fromkeys(names))

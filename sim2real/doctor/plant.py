@@ -35,7 +35,7 @@ class Plant:
 
     Attributes:
         delay_s: From a target in the log to the motion in the log [s].
-        kp, kd, friction, armature: Factors beside the contract's gains and the model.
+        kp, kd, friction: Factors beside the contract's gains and the model.
         limits: Torque limit of each joint, a share of the largest torque that its targets ask for; empty: the model's.
         payload: Added mass of the heaviest body, as a share of the robot's.
     """
@@ -45,7 +45,6 @@ class Plant:
     kd: float = 1.0
     limits: tuple[float, ...] = ()
     friction: float = 1.0
-    armature: float = 1.0
     payload: float = 0.0
 
 
@@ -110,11 +109,10 @@ class Drives:
         self.torque_driven = contract.drive == "torque"
         limits = []
         for i in ids:
-            low, high = given.jnt_actfrcrange[i] if given.jnt_actfrclimited[i] else (0.0, 0.0)
+            high = given.jnt_actfrcrange[i, 1] if given.jnt_actfrclimited[i] else 0.0
             if i in own and given.actuator_forcelimited[own[i]]:
                 high = given.actuator_forcerange[own[i], 1]
             limits.append(float(high) if high > 0 else 1e6)
-            del low
         self.limit = np.array(limits)
         for element in (*spec.actuators, *spec.keys, *spec.sensors):
             spec.delete(element)
@@ -144,7 +142,6 @@ class Drives:
         limit = np.minimum(self.limit, asked * plant.limits if plant.limits else np.inf)
         model.actuator_forcerange[:, 0], model.actuator_forcerange[:, 1] = -limit, limit
         model.dof_frictionloss[self.dof] *= plant.friction
-        model.dof_armature[self.dof] *= plant.armature
         if plant.payload:
             model.body_mass[self.loaded] += plant.payload * float(self.model.body_mass.sum())
         return model

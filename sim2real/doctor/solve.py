@@ -96,8 +96,8 @@ class Deployed:
     def __init__(self, log: Log, policy: Policy) -> None:
         self.log, self.policy, self.contract = log, policy, policy.contract
         c = self.contract
-        self._default, self._scale = c.per_joint("default_joint_pos"), c.per_joint("action_scale")
-        self._default = self._default if c.drive == "position" else np.zeros_like(self._default)
+        self._pose, self._scale = c.per_joint("default_joint_pos"), c.per_joint("action_scale")
+        self._default = self._pose if c.drive == "position" else np.zeros_like(self._pose)  # the target of action 0
         self._states: dict[float, dict[str, np.ndarray]] = {}
         longest = max(term.history for term in c.observation)
         first = min(max(longest + 1, len(log.t) // 10), len(log.t) // 2)
@@ -125,10 +125,8 @@ class Deployed:
             q, dq = q[:, how.order], dq[:, how.order]
         if how.signs:
             q, dq = q * how.signs, dq * how.signs
-        base = np.zeros_like(self._default) if self.contract.drive == "torque" else self._default
-        base = self.contract.per_joint("default_joint_pos") if self.contract.drive == "torque" else base
         relative = {t.relative for t in self.contract.observation if t.kind == "joint_pos"} != {False}
-        angle = q - base * relative - (np.array(how.offset) if how.offset else 0.0)
+        angle = q - self._pose * relative - (np.array(how.offset) if how.offset else 0.0)
         if how.turned:
             angle, dq = angle * how.turned, dq * how.turned
         made = {"joint_pos": angle, "joint_vel": dq, "sin_joint_pos": np.sin(q), "cos_joint_pos": np.cos(q)}
@@ -356,17 +354,13 @@ class Search:
         error = self.error(chosen[-1].making) if chosen else before
         if error < max(SOUND, 0.1 * before):
             return chosen
-        starts = [[], *([c] for c in self._alone(chosen)), chosen] if chosen else [[]]
         tried = []
-        for base in starts:
+        for base in {len(part): part for part in ([], chosen[:1], chosen)}.values():
             how = base[-1].making if base else Making()
             fitted = self._affine(how)
             tried.append([*base, Candidate("normaliser", "the observation is normalised with other numbers", fitted)])
         best = min(tried, key=lambda c: self.error(c[-1].making) * (1 + 0.1 * len(c)))
         return best if self.error(best[-1].making) < 0.5 * error else chosen
-
-    def _alone(self, chosen: Sequence[Candidate]) -> list[Candidate]:
-        return [chosen[0]] if len(chosen) > 1 else []
 
     def _affine(self, how: Making) -> Making:
         """Fit gain and bias of each entry of the observation by Gauss and Newton's steps."""

@@ -141,6 +141,18 @@ def test_a_log_without_actions_and_targets_is_refused(tmp_path: Path) -> None:
         read_deployment(tmp_path / "log.npz", JOINTS, 4)
 
 
+@pytest.mark.parametrize("signal", ["obs", "command", "gyro"])
+def test_rows_without_times_that_fit_nothing_are_refused(signal: str, tmp_path: Path) -> None:
+    """One row holds for all; another number of rows says nothing about when they were."""
+    log = {"t": np.arange(50) / 50, "q": np.zeros((50, 4)), "target": np.zeros((50, 4))}
+    np.savez(tmp_path / "log.npz", **log, **{signal: np.ones((1, 3))})
+    held = getattr(read_deployment(tmp_path / "log.npz", JOINTS, 4), signal)
+    assert held.shape == (50, 3)
+    np.savez(tmp_path / "log.npz", **log, **{signal: np.ones((40, 3))})
+    with pytest.raises(UsageError, match=f"{signal} has 40 rows"):
+        read_deployment(tmp_path / "log.npz", JOINTS, 4)
+
+
 def test_mirrored_joints() -> None:
     assert mirror_of(JOINTS) == (2, 3, 0, 1)
     assert mirror_of(("left_knee_joint", "right_knee_joint", "waist")) == (1, 0, 2)
@@ -177,6 +189,15 @@ def test_metadata_of_mjlab_lack_the_rate_alone(tmp_path: Path) -> None:
     contract = read_policy(policy, tmp_path / "contract.toml").contract
     assert contract.per_joint("kp").tolist() == [20, 30, 20, 30]
     assert contract.layout[2:4] == [(2, 1), (2, 0)]
+
+
+def test_metadata_have_any_form_of_a_number(tmp_path: Path) -> None:
+    forms = METADATA | {"joint_stiffness": "2e+01, 3.0E1, +40, 50.", "action_scale": "[.25]", "step_dt": "0.02"}
+    contract = read_policy(written(tmp_path, forms), out=tmp_path).contract
+    assert contract.per_joint("kp").tolist() == [20, 30, 40, 50]
+    assert contract.per_joint("action_scale").tolist() == [0.25] * 4
+    with pytest.raises(UsageError, match="action_scale"):
+        read_policy(written(tmp_path, forms | {"action_scale": "a quarter"}), out=tmp_path)
 
 
 @pytest.mark.parametrize("value", ["1.000", "0.000", "-0.000"])
