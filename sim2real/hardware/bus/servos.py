@@ -171,6 +171,13 @@ class Servos(Device):
         self._low = np.array([j.low_count if positions else drive.goal.minimum for j in joints_])
         self._high = np.array([j.high_count if positions else drive.goal.maximum for j in joints_])
         self._goals = np.zeros(n, np.int64)
+        # The registers of the state, in one block, and units of speed and load; `open` reads the servos' own of speed.
+        state = (family.position, family.velocity, family.load)
+        self._state = sorted(state, key=lambda register: register.address)
+        self._of_state = [self._state.index(register) for register in state]
+        sign = np.array([joint.direction for joint in joints_])
+        self._turns, self._load = sign * np.array([joint.gear for joint in joints_]), sign * family.load.unit
+        self._speed = self._turns * family.velocity.unit
 
     # -- what differs between families
 
@@ -266,6 +273,7 @@ class Servos(Device):
                 self.prepare(joint)
                 self._write(joint.servo_id, self.settings(joint.servo_id))
                 self._narrow(joint)
+            self._speed = self._turns * np.array([self.speed_unit(i) for i in self.ids])
         except BaseException:
             self.close()
             raise
@@ -331,18 +339,12 @@ class Servos(Device):
 
     def measure(self) -> Reading:
         """Read angles [rad], speeds [rad/s] and loads, fractions of the largest, of all joints."""
-        family = self.family
-        state = sorted((family.position, family.velocity, family.load), key=lambda register: register.address)
-        counts, transaction = self.link.read_counts(self.ids, state, "read of the state")
-        position, speed, load = (
-            counts[:, state.index(register)] for register in (family.position, family.velocity, family.load)
-        )
-        sign = np.array([joint.direction for joint in self.joints])
-        gear = np.array([joint.gear for joint in self.joints])
+        counts, transaction = self.link.read_counts(self.ids, self._state, "read of the state")
+        position, speed, load = (counts[:, i] for i in self._of_state)
         return Reading(
             position_rad=(position - self._at_zero) * self._rad,
-            velocity_rad_s=speed * np.array([self.speed_unit(i) for i in self.ids]) * sign * gear,
-            load=load * family.load.unit * sign,
+            velocity_rad_s=speed * self._speed,
+            load=load * self._load,
             transaction=transaction,
         )
 
