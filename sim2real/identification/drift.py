@@ -25,8 +25,9 @@ _TURNS = 3
 _FELT = 1e-3
 """Smallest change of residuals, over all of the bounds, with which a log tests a change [variances]."""
 _SMALL = 0.05
-"""Factors nearer to 1 are no change: small errors of a good model are significant. Of 16 unchanged hidden SO-101 three
-seemed to have 8 to 14 % more friction."""
+"""Factors nearer to 1 are no change, nor is a smaller share of the round-trip delay: small errors of a good model are
+significant. Of 16 unchanged hidden SO-101 three seemed to have 8 to 14 % more friction; a pendulum's delay of 54 ms,
+identified a minute before, seemed to be 0.4 ms longer."""
 _LEAST = 0.1
 """Smallest share of the error that a change explains in an alarm. In 112 changed robots the right
 change explained 0.2 or more; in nine unchanged ones a torque limit explained 0.05 at most."""
@@ -248,7 +249,7 @@ def weigh(fitted: Sequence[Fitted], loss: float, table: ParameterTable, posterio
     """Return the significant changes: all tests together raise an alarm for 5 % of unchanged robots.
 
     Tests use Holm's correction (Scandinavian Journal of Statistics 6, 1979) and Student's distribution. A factor is
-    compared with a small one instead of with 1.
+    compared with a small one instead of with 1, a delay with a small share of the round trip instead of with 0.
 
     Args:
         fitted: The fit of each change, the one that explains most first.
@@ -259,7 +260,7 @@ def weigh(fitted: Sequence[Fitted], loss: float, table: ParameterTable, posterio
     for one in fitted:
         error = (one.by_log + one.by_posterior) ** 0.5
         reach = error * float(stdtrit(one.freedom, 0.975))
-        small = 0.0 if _absolute(one.way.name, table) else _SMALL
+        small = _small(one.way.name, table, posterior)
         p = sum(float(stdtr(one.freedom, (sign * small - abs(one.size)) / error)) for sign in (1, -1))
         ends = (one.size, one.size - reach, one.size + reach)
         explains = 1.0 - one.loss / max(loss, 1e-300)
@@ -278,11 +279,18 @@ def _holm(rows: Sequence[Changed]) -> list[str]:
     return [name for name in alarms if explains[name] >= _LEAST]
 
 
-def _absolute(name: str, table: ParameterTable) -> bool:
-    """Return whether a change is no factor: of a delay, a payload, an offset."""
-    if name not in table.names:
-        return name == ROUND_TRIP
-    return table.columns[table.names.index(name)].transform != "log"
+def _small(name: str, table: ParameterTable, posterior: Posterior) -> float:
+    """Return the largest size, on its scale, of what counts as no change: 0 for a payload or an offset."""
+    column = table.columns[table.names.index(name)] if name in table.names else None
+    if name == ROUND_TRIP or (column is not None and column.kind == "delay"):
+        return _SMALL * _round_trip_s(table, posterior)
+    return _SMALL if column is None or column.transform == "log" else 0.0
+
+
+def _round_trip_s(table: ParameterTable, posterior: Posterior) -> float:
+    """Return the sum of the identified and the fixed delays [s]."""
+    identified = sum(x for x, c in zip(posterior.mean, table.columns, strict=True) if c.kind == "delay")
+    return float(identified + sum(p.nominal for p in table if p.kind == "delay" and not p.free))
 
 
 def _values(
@@ -290,10 +298,9 @@ def _values(
 ) -> tuple[str, float, float, float, float]:
     """Return the unit, the value before, and those after moving by ``ends`` on the scale; of a cause factors."""
     if name == ROUND_TRIP and name not in posterior.names:
-        total = sum(x for x, c in zip(posterior.mean, table.columns, strict=True) if c.kind == "delay")
-        total += sum(p.nominal for p in table if p.kind == "delay" and not p.free)
+        total = _round_trip_s(table, posterior)
         now, low, high = (float(max(total + e, 0.0)) for e in ends)
-        return "s", float(total), now, low, high
+        return "s", total, now, low, high
     if name not in posterior.names:
         now, low, high = (float(np.exp(e)) for e in ends)
         return "", 1.0, now, low, high

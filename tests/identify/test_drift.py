@@ -37,7 +37,7 @@ def test_the_delay_changes_as_a_sum_and_causes_of_other_robots_are_left_out():
 
 @pytest.fixture(params=[1, -1], ids=["more", "less"])
 def hardly_changed(request):
-    """Sizes of changes of 4,000 robots ``(N, ways)``: factors off by what does not count, delays not at all."""
+    """Sizes of changes of 4,000 robots ``(N, ways)``: factors off by what does not count, delays hardly at all."""
     small = [0.0 if name == "round_trip_delay" else request.param * 0.05 for name in WAYS]
     return small + np.sqrt(2e-3) * np.random.default_rng(0).standard_normal((4000, len(WAYS)))
 
@@ -51,6 +51,13 @@ def raised(sizes, loss=0.5):
 def test_at_most_one_in_twenty_robots_that_hardly_changed_raises_an_alarm(hardly_changed):
     assert raised(hardly_changed) == pytest.approx(0.045, abs=0.01)
     assert raised(2 * hardly_changed) > 0.2, "that would fail if the test were too lax"
+
+
+def test_a_delay_that_is_a_twentieth_longer_is_no_change():
+    """However sure it is, and however much of a small error it explains."""
+    for size, alarms in {0.0004: (), 0.0024: (), 0.0027: ("round_trip_delay",)}.items():  # of 50 ms
+        longer = alone("round_trip_delay", size, own=1e-12, before=1e-12, loss=0.1)
+        assert weigh([longer], 1.0, TABLE, POSTERIOR, 20.0).alarms == alarms
 
 
 def test_what_explains_next_to_nothing_raises_none():
