@@ -28,17 +28,14 @@ from benches.rows import ROOT, missed, text_of
 
 BENCHES = {
     "arm": ("runs.arm", "the arm's whole run"),
-    "async": ("asynchronous", "the simulated clock's speed, and the wall clock's lateness"),
     "compose": ("compose", "control steps against dm_control, tasks on Warp against bare steps"),
     "demo": ("runs.demo", "the pendulum's whole run for several seeds"),
     "doctor": ("doctor", "faults of deployments that the doctor names, on robots drawn at random"),
     "drift": ("drift", "how often the drift test detects and names a change of a hidden SO-101"),
-    "faults": ("faults", "faults while a policy runs: time until the motor is safe, the log, exit code and message"),
     "graph": ("graph", "the compiled graph against a robot written by hand"),
     "latency-league": ("latency", "six emulated links, whose delays four methods estimate"),
     "league": ("recorded.league", "every recording, held out in parts, against mujoco.sysid, PACE and BAM"),
     "legs-identify": ("legs_identify", "hidden Go2s: the errors of identified parameters and delays"),
-    "light": ("light", "sim2real-robot in a new environment: its size, and record's processor time"),
     "randomise": ("hidden.randomise", "success on hidden robots by what the training was given"),
     "runner": ("runner", "a step of a policy in numpy, and the loop of an emulated Go2 at 500 Hz"),
     "scaling": ("train", "training on all devices of a host against one"),
@@ -46,7 +43,6 @@ BENCHES = {
     "train": ("train", "PPO on the pendulum with its delays"),
     "walk": ("walk", "a walking policy on hidden twins in C MuJoCo: falls and errors"),
     "walk-delays": ("walking.delays", "falls over the true delay, by the delays that the policy was trained with"),
-    "walk-rival": ("walking.rival", "learnt steps a second of our PPO and of MuJoCo Playground's on one GPU"),
     "walk-train": ("walking.train", "a walking policy on one GPU: time to a policy that stays up"),
 }  # fmt: skip
 """Name -> module in ``benches/`` with ``add_flags``, ``run``, ``table`` and ``QUICK`` (flags of --quick); summary."""

@@ -16,9 +16,9 @@ import canary  # noqa: E402
 import figures  # noqa: E402
 from benches.rows import missed, row, text_of  # noqa: E402
 
-PROCESSES = ("arm", "async", "demo", "faults", "light", "runner", "so101")
+PROCESSES = ("arm", "demo", "runner", "so101")
 """Benches that start robots or keep deadlines on the wall clock."""
-ON_A_GPU = ("walk-rival", "walk-train")
+ON_A_GPU = ("walk-train",)
 FLAGS = {"compose": ["--parts", "step"], "graph": ["--mjx", "0"], "randomise": ["--ways", "all", "--record-s", "12"]}
 ON_A_CPU = [
     pytest.param(name, marks=[pytest.mark.process] if name in PROCESSES else [])

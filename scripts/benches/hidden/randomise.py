@@ -7,7 +7,6 @@ have play. A deployment succeeds that stays up: within 18 degrees of upright for
 from __future__ import annotations
 
 import argparse
-import math
 import tempfile
 import time
 from collections.abc import Callable
@@ -37,7 +36,6 @@ WAYS: dict[str, dict[str, Any]] = {
 """Data sheet; 30 % around it; the estimate; its posterior; the posterior with misfit, timing and noise. The width of
 the draws grows to its final value during the training."""
 WEAR = hidden.Wear(jitter_s=0.008, lost=0.05, play_rad=0.02, noise_rad=0.05, hiccups_hz=1.5, hiccup_s=0.04)
-PLANT = f"{Path(__file__).with_name('plant.py')}:HiddenPlant"
 QUICK = {"robots": 1, "trials": 1, "seconds": 2.0, "steps": 512, "generations": 5, "record_s": 8.0, "envs": 16}
 
 
@@ -57,7 +55,6 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--envs", type=int, default=256, help="copies of a training")
     parser.add_argument("--generations", type=int, default=80, help="generations of the search")
     parser.add_argument("--ways", nargs="*", default=list(WAYS), choices=list(WAYS), help="kinds of training")
-    parser.add_argument("--clock", choices=["simulated", "wall"], default="simulated", help="of the robots")
     parser.add_argument("--jobs", type=int, default=1, help="robots at once, one process each; 1: in this process")
 
 
@@ -78,7 +75,7 @@ def rows(outcomes: list[Row], options: argparse.Namespace, seconds: float) -> li
         good = np.array([np.array(robot["ways"][way]["success"]) >= UPRIGHT for robot in outcomes])
         still = np.array([np.mean(np.array(robot["ways"][way].get("still", [0.0])) >= UPRIGHT) for robot in outcomes])
         value, low, high = share(int(good.sum()), good.size)
-        name = f"randomise/{'wall/' if options.clock == 'wall' else ''}{way}"
+        name = f"randomise/{way}"
         lines += [
             row(f"{name}/success", value, f"of {good.size} deployments", "", ">= 0.95" if way == "all" else ""),
             row(f"{name}/low95", low, "share"),
@@ -102,14 +99,14 @@ def one_robot(number: int, options: argparse.Namespace) -> dict[str, Any]:
     robot, pipeline = hidden.Hidden.draw(number, wear), load_robot("pendulum")
     ways: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as folder:
-        recording = recorded(robot, pipeline, options, Path(folder) / "record")
+        recording = recorded(robot, options, Path(folder) / "session.mcap")
         config = replace(pipeline.defaults.identify, folds=0, generations=options.generations, seed=number)
         identified = sim2real.identify(pipeline, recording, config)
         for way in options.ways:
             begin = time.perf_counter()
             try:
                 bundle = sim2real.train(pipeline, identified, train_config(pipeline, way, number, options))
-                motions = deployed(robot, pipeline, bundle, options, Path(folder) / way)
+                motions = [played(robot, bundle, options, 1 + trial) for trial in range(options.trials)]
             except Sim2RealError as error:  # a policy that is not trained, or that the gate stops, has no success
                 ways[way] = {"success": [0.0] * options.trials, "refused": str(error)}
                 print(f"robot {number}, {way}: {error}", flush=True)
@@ -124,27 +121,13 @@ def one_robot(number: int, options: argparse.Namespace) -> dict[str, Any]:
     return {"number": number, "verdict": identified.verdict.status, "ways": ways}
 
 
-def recorded(robot: hidden.Hidden, pipeline: Any, options: argparse.Namespace, folder: Path) -> Any:
+def recorded(robot: hidden.Hidden, options: argparse.Namespace, path: Path) -> Any:
     """Return a recording of the robot."""
     from sim2real.artifacts.recording import Recording
 
-    if options.clock == "wall":
-        put_on_the_bus(robot, pipeline)
-        return record_on_the_bus(pipeline, folder, options.record_s, options.record_volts, robot.seed)
     excited = hidden.excited(options.record_s, robot.seed, options.record_volts)
-    folder.mkdir()
-    path = folder / "session.mcap"
     hidden.write(path, hidden.play(robot, excited, options.record_s, 0))
     return Recording.load(path)
-
-
-def deployed(
-    robot: hidden.Hidden, pipeline: Any, bundle: Any, options: argparse.Namespace, folder: Path
-) -> list[tuple[np.ndarray, ...]]:
-    """Return times [s], true angles [rad] and speeds [rad/s] of each deployment of a policy."""
-    if options.clock == "wall":
-        return deploy_on_the_bus(pipeline, bundle, folder, options.seconds, options.trials)
-    return [played(robot, bundle, options, 1 + trial) for trial in range(options.trials)]
 
 
 def played(robot: hidden.Hidden, bundle: Any, options: argparse.Namespace, session: int) -> tuple[np.ndarray, ...]:
@@ -199,63 +182,6 @@ def controller(bundle: Any, volts: float) -> Callable[[float, float], float]:
     return act
 
 
-# On the wall clock: as emulated servos on a bus, recorded and deployed to by the stages themselves.
-
-
-def put_on_the_bus(robot: hidden.Hidden, pipeline: Any) -> None:
-    """Make a hidden robot the pipeline's emulated one, for this process; latencies are uniform, as wide as its own.
-
-    The computer's own pauses are those of this machine: ``hiccups`` are not played.
-    """
-    pipeline_robot = pipeline
-    jitter = math.sqrt(3.0) * robot.jitter
-    emulator = replace(
-        pipeline_robot.drive.embedded.emulator,
-        sensing_latency_s=robot.sensing,
-        sensing_jitter_s=min(jitter, robot.sensing),
-        actuation_latency_s=robot.acting,
-        actuation_jitter_s=min(jitter, robot.acting),
-        reply_loss=float(robot.lost),
-    )
-    names = ("gain", "gravity", "damping", "friction", "play", "noise")
-    plant = {n: float(getattr(robot, n)) for n in names} | {
-        "speed_noise": float(hidden.SPEED_NOISE * robot.noise),
-        "seed": robot.seed,
-    }
-    pipeline_robot.drive.embedded = replace(
-        pipeline_robot.drive.embedded, plant=PLANT, emulator=emulator, plant_args=plant
-    )
-
-
-def record_on_the_bus(pipeline: Any, folder: Path, seconds: float, volts: float, seed: int) -> Any:
-    """Return a recording of the robot on the bus.
-
-    Args:
-        volts: Its largest voltage [V].
-    """
-    import sim2real
-
-    folder.mkdir()
-    config = replace(pipeline.defaults.record, duration_s=seconds, amplitude=volts, seed=seed)
-    return sim2real.record(pipeline, folder, config)
-
-
-def deploy_on_the_bus(
-    pipeline: Any, bundle: Any, folder: Path, seconds: float, trials: int
-) -> list[tuple[np.ndarray, ...]]:
-    """Return times [s], true angles [rad] and speeds [rad/s] of each deployment to the robot on the bus."""
-    import sim2real
-
-    folder.mkdir()
-    config = replace(pipeline.defaults.deploy, duration_s=seconds, episodes=trials, measure_delay=False)
-    deployment = sim2real.deploy(pipeline, bundle, folder, config)
-    motions = []
-    for recording in deployment.recordings:
-        t_s, states = recording.true_states()
-        motions.append((t_s, states["th"], states["thdot"]))
-    return motions
-
-
 TRAINED_ON = {
     "data_sheet": "data-sheet values, no delays",
     "uniform": "data-sheet values, varied by 30 %",
@@ -276,22 +202,6 @@ def table(ideal: Report, worn: Report) -> str:
     count, trials = (ideal["flags"][name] for name in ("robots", "trials"))
     head = f"trained on, {count} hidden robots with {trials} deployments each"
     return markdown([head, "nearly ideal", "95 %", "worn", "95 %"], lines)
-
-
-def sentence(report: Report) -> str:
-    """Return the success of worn robots that were deployed to on the wall clock, as emulated servos."""
-    v, flags = values(report, "randomise/wall/"), report["flags"]
-    runs = flags["robots"] * flags["trials"]
-
-    def of(way: str) -> str:
-        upright, still = (round(runs * v[f"{way}/{what}"]) for what in ("success", "still"))
-        return f"{upright} of {runs} were upright, {still} of these slower than {STILL_RAD_S} rad/s"
-
-    return (
-        f"{flags['robots']} worn robots were also deployed on the wall clock, as emulated servos, "
-        f"{flags['trials']} deployments each. After training on the\nestimate alone {of('point')};\nafter training on "
-        f"posterior, misfit, timing and noise {of('all')}.\n"
-    )
 
 
 def figure(ideal: Report, worn: Report) -> Figure:
