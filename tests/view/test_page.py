@@ -12,6 +12,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 import synthetic_run
+from installed import need
 from sketches import sketched
 
 from sim2real.artifacts.identification import Identification, Judgement, WorstSecond
@@ -258,9 +259,8 @@ def test_a_value_has_as_many_decimals_as_its_standard_error_is_worth():
     assert fixed(8.507, decimals_for(None, 8.507)) == "8.507"
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
 def test_a_browser_shows_it_without_an_error(path, tmp_path):
-    assert CHROMIUM is not None
+    need(CHROMIUM, "chromium")
     url = path.resolve().as_uri()
     command = [CHROMIUM, *FLAGS, f"--user-data-dir={tmp_path}", "--dump-dom", url]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)

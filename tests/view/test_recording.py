@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import synthetic_run
+from installed import need
 
 from sim2real.artifacts.run import finished_stages
 from sim2real.errors import Sim2RealError
@@ -28,7 +29,6 @@ RERUN = Path(sysconfig.get_path("scripts")) / "rerun"
 LAVAPIPE = Path("/usr/share/vulkan/icd.d/lvp_icd.x86_64.json")
 FIRST_TAB = {"measured", "truth", "command"}
 """Roles of the curves in the tab that is open at first, that of the record stage."""
-needs_vulkan = pytest.mark.skipif(not LAVAPIPE.exists(), reason="no software Vulkan (mesa-vulkan-drivers) is installed")
 needs_rerun = pytest.mark.skipif(not RERUN.exists(), reason="rerun-sdk is not installed")
 
 
@@ -192,9 +192,9 @@ def software_vulkan(monkeypatch):
 
 
 @needs_rerun
-@needs_vulkan
 @pytest.mark.usefixtures("software_vulkan")
 def test_the_viewer_draws_the_curves(saved, tmp_path):
+    need(LAVAPIPE.exists(), "a software Vulkan (mesa-vulkan-drivers)")
     assert drawn_roles(saved, tmp_path / "run.png") == FIRST_TAB
 
 
