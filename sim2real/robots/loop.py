@@ -248,10 +248,8 @@ class IdentifiableLoop:
 
     def nodes(self, max_delay_s: float) -> dict[str, BaseNode]:
         """Return sensor, actuator and world, connected with delays of up to ``max_delay_s`` [s]."""
-        from sim2real.robots.nodes import SimSensor
-
         robot, world = self._robot, self._robot.model.make_world(resumed=True)
-        sensor = SimSensor(SENSOR, robot.rate_hz, world)
+        sensor = robot.sim_sensor(world)
         return recorded_loop(sensor, robot.sim_actuator(), world, max_delay_s, self.ahead_s, robot.model.lead_s)
 
     def reached(self, recordings: Sequence[Episode]) -> Mapping[str, float]:

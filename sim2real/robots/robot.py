@@ -505,7 +505,7 @@ class Robot(RecordedRobot):
         )
         # Make the nodes and connect them.
         world, agent = robot.model.make_world(), self.agent.make(rate, **on_agent)
-        sensor = SimSensor(SENSOR, rate, world, **on_sensor)
+        sensor = self.sim_sensor(world, **on_sensor)
         sensor.noise = self.sensor.noise
         nodes = simulated_loop(sensor, agent, self.sim_actuator(**on_actuator), world, bounds)
         return nodes, LoopTask(robot, agent, values, draws)
@@ -538,6 +538,10 @@ class Robot(RecordedRobot):
             ACTUATOR: DelayParams(delay=values.get(DELAYS[1])),
             AGENT: self.agent.params(start, policy),
         }
+
+    def sim_sensor(self, world: BaseNode, **options: Unpack[NodeOptions]) -> SimSensor:
+        """Return the encoders in simulation, without noise."""
+        return SimSensor(SENSOR, self.rate_hz, world, **options)
 
     def sim_actuator(self, **options: Unpack[NodeOptions]) -> SimActuator:
         """Return the bus in simulation."""
