@@ -134,12 +134,12 @@ class RuntimeConformance(ABC):
 
     def test_messages_of_every_dtype_arrive_as_they_were_sent(self) -> None:
         """The same with messages of random dtypes, and trainable delays, at which integers and booleans hold."""
-        for seed in self.seeds[:3] if self.trainable else ():
+        for seed in self.seeds[:1] if self.trainable else ():
             self.check(random_graph(seed, make=type(self).make, trainable=True), seed)
 
     def test_floats_lie_between_the_messages_that_the_rules_say(self) -> None:
         """Values of trainable delays, which interpolate, under blocking inputs and bursts."""
-        for seed in self.seeds[:3] if self.trainable else ():
+        for seed in self.seeds[:1] if self.trainable else ():
             self.check(random_graph(seed, make=contracting_node, trainable=True), seed, floats=True)
 
     def check(self, nodes: Mapping[str, BaseNode], seed: int, floats: bool = False) -> None:

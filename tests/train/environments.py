@@ -1,84 +1,12 @@
-"""Small environments with known answers, and the pendulum that the defaults of PPO were tuned on."""
+"""Small environments with known answers."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 
 from sim2real.training.environment.protocol import Step, TrainingEnvironment
-
-
-@struct.dataclass
-class PendulumState:
-    x: Any  # (2,): angle from upright [rad], angular velocity [rad/s]
-    command: Any  # (1,): sent, not yet acting [V]
-    measured: Any  # (2,): taken, not yet arrived
-    observations: Any  # (4, 3)
-    actions: Any  # (4, 1)
-    upright: Any
-    row: Any
-
-
-def _ode(x, u):
-    J, m, length, b, K, R, c = 1.59931e-4, 0.0508582, 0.0415234, 1.43298e-5, 0.0333391, 7.73125, 9.75041e-4
-    th, thd = x
-    torque = u * K / R + m * 9.81 * length * jnp.sin(th) - b * thd - thd * K * K / R - c * jnp.sign(thd)
-    return jnp.stack([thd, torque / J])
-
-
-def _physics(x, u, dt=0.02, substeps=2):
-    h = dt / substeps
-    for _ in range(substeps):
-        k1 = _ode(x, u)
-        k2 = _ode(x + k1 * h / 2, u)
-        k3 = _ode(x + k2 * h / 2, u)
-        k4 = _ode(x + k3 * h, u)
-        x = x + (k1 + 2 * k2 + 2 * k3 + k4) * h / 6
-        x = x.at[1].set(jnp.clip(x[1], -40, 40))
-    return x
-
-
-class Pendulum(TrainingEnvironment):
-    """Swing-up at 50 Hz for 5 s; a command acts one step late and a measurement arrives one step late."""
-
-    observation_size = 19
-    action_low = np.array([-2.0], np.float32)
-    action_high = np.array([2.0], np.float32)
-    rows = 250
-
-    def reset(self, key):
-        th, thd = jax.random.uniform(key, (2,), minval=-1.0) * jnp.array([jnp.pi, 0.0])
-        x = jnp.stack([th, thd])
-        state = PendulumState(x, jnp.zeros(1), x, jnp.zeros((4, 3)), jnp.zeros((4, 1)), jnp.float32(0), jnp.int32(0))
-        return state, self._observe(state)
-
-    def _observe(self, state):
-        th, thd = state.measured
-        now = jnp.stack([jnp.cos(th), jnp.sin(th), thd])
-        return jnp.concatenate([now, state.observations.ravel(), state.actions.ravel()])
-
-    def step(self, state, action, key):
-        x = _physics(state.x, state.command[0])
-        n = x[0] - 2 * jnp.pi * jnp.floor((x[0] + jnp.pi) / (2 * jnp.pi))
-        cost = n**2 + 0.1 * (x[1] / (1 + 10 * jnp.abs(n))) ** 2 + 0.01 * state.command[0] ** 2
-        upright = state.upright + jnp.where((jnp.cos(n) > 0.95) & (jnp.abs(x[1]) < 0.5), 1.0, 0.0)
-        seen = self._observe(state)[:3]
-        new = PendulumState(
-            x=x,
-            command=action,
-            measured=state.x,
-            observations=jnp.concatenate([seen[None], state.observations[:-1]]),
-            actions=jnp.concatenate([action[None], state.actions[:-1]]),
-            upright=upright,
-            row=state.row + 1,
-        )
-        end = new.row >= self.rows
-        metrics = {"success": upright / self.rows}
-        return Step(new, self._observe(new), -cost, jnp.bool_(False), end, jnp.bool_(True), metrics)
 
 
 class Bandit(TrainingEnvironment):

@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from advantages import slow
 
 from sim2real.errors import UsageError
 from sim2real.graph.schedule import draw
@@ -13,8 +12,6 @@ from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.stages.load import load_robot
 from sim2real.training.environment.graph_environment import GraphEnvironment
 from sim2real.training.environment.tasks import checked_end, terms_of, total_of
-from sim2real.training.ppo.losses import gae
-from sim2real.training.ppo.rollout import Rows
 
 FAST = 8.0
 """A pendulum that turns faster has failed [rad/s]."""
@@ -59,22 +56,6 @@ def test_a_robot_says_when_an_episode_has_ended(played):
     np.testing.assert_array_equal(played.terminated, fast)
     assert 0.05 < fast.mean() < 0.95
     np.testing.assert_array_equal(np.flatnonzero(played.truncated.all(1)), [len(played.truncated) - 1])
-
-
-def test_nothing_follows_a_fall_and_the_value_goes_on_where_time_is_up(played):
-    """Advantages of the environment's own rows, by the trainer and by the definition."""
-    rows, shape = played, played.reward.shape
-    value, following = np.random.default_rng(0).normal(size=(2, *shape)).astype(np.float32)
-    ended = rows.terminated | rows.truncated
-    following[:-1][~ended[:-1]] = value[1:][~ended[:-1]]
-    empty = np.zeros((*shape, 0))
-    flags = (rows.terminated, rows.truncated, rows.valid)
-    made = Rows(empty, empty, *map(jnp.asarray, (rows.reward, *flags)), following=empty, metrics={})
-    found = np.asarray(gae(made, jnp.asarray(value), jnp.asarray(following), 0.9, 0.8))
-    for i in range(COPIES):
-        expected = slow(*(leaf[:, i] for leaf in (rows.reward, *flags, value, following)), 0.9, 0.8)
-        valid = rows.valid[:, i]
-        np.testing.assert_allclose(found[valid, i], expected[valid], rtol=1e-4, atol=1e-4)
 
 
 def test_named_terms_of_the_reward_add_up_to_the_return(played):

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from environments import Bandit, Constant, Counter, Pendulum
+from environments import Bandit, Constant
 
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.training.config import PPOConfig
@@ -67,16 +67,6 @@ def test_a_seed_does_not_depend_on_its_neighbours(bandit):
     assert not np.allclose(result.history["entropy"][-1, 0], result.history["entropy"][-1, 1])
 
 
-@pytest.mark.night
-@pytest.mark.parametrize("rollout_steps", [2, pytest.param(8, marks=pytest.mark.night)])
-def test_a_test_within_training_plays_one_whole_episode_per_copy(rollout_steps):
-    """Also where it takes several rollouts, and where episodes for training are cut before."""
-    config = dataclasses.replace(TINY, rollout_steps=rollout_steps, eval_steps=5, evaluations=2)
-    history = train(Counter(length=5), config, jax.random.key(0)).history
-    for name, value in {"return": 10.0, "rows": 5.0, "finished": 1.0, "terminated": 1.0}.items():
-        np.testing.assert_array_equal(history[name], value, name)
-
-
 def test_no_key_is_used_twice():
     """To play, to shuffle and to evaluate, in every update: however often one evaluates."""
     made = [keys(SimpleNamespace(key=jax.random.key(3), update=jnp.int32(i))) for i in range(5)]
@@ -94,14 +84,13 @@ def blind_value(length, window, gamma):
     return rewards / (1.0 - np.mean([gamma**to_end * (left > to_end) for left, to_end in cells]))
 
 
+@pytest.mark.night  # the advantages of all three are exact in test_gae.py, and rows in test_rollout.py
 @pytest.mark.parametrize(
     ("env", "value"),
     [
         pytest.param(Constant(ends="truncated"), 10.0, id="truncation goes on for ever"),
-        pytest.param(
-            Constant(ends="truncated", rows_per_step=2), 10.0, id="rows without a policy step", marks=pytest.mark.night
-        ),
-        pytest.param(Constant(ends="terminated"), blind_value(8, 16, 0.9), id="termination", marks=pytest.mark.night),
+        pytest.param(Constant(ends="truncated", rows_per_step=2), 10.0, id="rows without a policy step"),
+        pytest.param(Constant(ends="terminated"), blind_value(8, 16, 0.9), id="termination"),
     ],
 )
 def test_value_of_a_constant_reward(env, value):
@@ -181,14 +170,6 @@ def test_a_broken_environment_is_refused_before_compiling(env, message):
 def test_impossible_settings_are_refused(change, message):
     with pytest.raises(UsageError, match=message):
         dataclasses.replace(SMALL, **change)
-
-
-@pytest.mark.night
-def test_pendulum_with_delays_swings_up():
-    """Half a million steps; in `make test` the bandit's tests say that training finds the best action."""
-    config = PPOConfig(total_steps=500_000, evaluations=5)
-    result = train(Pendulum(), config, jax.random.key(0))
-    assert result.history["success"].max() > 0.7
 
 
 @pytest.mark.night
