@@ -36,6 +36,7 @@ BENCHES = {
     "latency-league": ("latency", "six emulated links, whose delays four methods estimate"),
     "league": ("recorded.league", "every recording, held out in parts, against mujoco.sysid, PACE and BAM"),
     "legs-identify": ("legs_identify", "hidden Go2s: the errors of identified parameters and delays"),
+    "pays": ("pays", "what identification is worth: four ways to train, judged on the same hidden robots"),
     "randomise": ("hidden.randomise", "success on hidden robots by what the training was given"),
     "runner": ("runner", "a step of a policy in numpy, and the loop of an emulated Go2 at 500 Hz"),
     "scaling": ("train", "training on all devices of a host against one"),

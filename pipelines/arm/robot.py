@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from sim2real.robots.servo.drive import JointSensor, ServoDrive
 from sim2real.robots.servo.model import Hand, ServoModel, friction_causes
 from sim2real.robots.servo.observation import ServoAgent
 from sim2real.robots.servo.servos import Servos
+from sim2real.robots.servo.targets import target_tasks
 from sim2real.robots.servo.task import Aim, AimTask, ServoMoment, uniform
 from sim2real.robots.session import Embedded
 from sim2real.types import Array, Key
@@ -39,6 +41,10 @@ CLOSE_M = 0.02
 """How near the tip must come [m]."""
 LOW, HIGH = (-1.2, -0.3, -0.2), (1.2, 1.2, 1.4)
 """Joint angles between which targets are drawn [rad]: every target can be reached."""
+CENTRES = (-0.5, 0.3, 1.0), (0.5, 0.6, 1.3)
+"""The same for the centres of figures of eight [rad]."""
+FAST_RAD_S = 5.0
+"""Largest speed of the goals where time counts: that of the servos' profile [rad/s]."""
 FEATURES = (
     ("position", ("rad",) * 3, 5.0),
     ("velocity / 5", ("rad/s",) * 3, 6.0),
@@ -79,13 +85,17 @@ def draw_target(key: Key | int) -> Array:
 TARGET = Aim((("target x", "m"), ("target y", "m"), ("target z", "m")), draw_target)
 
 
+def way(position: Array, gap: Array) -> Any:
+    """Return a distance ``(3,)`` [m] in the frame of the arm at joint angles ``(3,)`` [rad]."""
+    xp = namespace(position, gap)
+    c, s = xp.cos(position[0]), xp.sin(position[0])
+    return xp.stack([c * gap[0] + s * gap[1], c * gap[1] - s * gap[0], gap[2]])
+
+
 def observe(reading: JointReading, goal: Array, aim: Array) -> Array:
     """Return ``FEATURES``: the joints, and the way to the target in the frame of the arm."""
     q, xp = reading.position, namespace(reading.position, goal)
-    gap = aim - tip_of(q)
-    c, s = xp.cos(q[0]), xp.sin(q[0])
-    way = xp.stack([c * gap[0] + s * gap[1], c * gap[1] - s * gap[0], gap[2]])
-    return xp.concatenate([q, reading.velocity / 5.0, goal - q, 10.0 * way])
+    return xp.concatenate([q, reading.velocity / 5.0, goal - q, 10.0 * way(q, aim - tip_of(q))])
 
 
 def distance_m(now: ServoMoment) -> jax.Array:
@@ -124,7 +134,7 @@ def score(t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float]
 
 
 class ArmRobot(Robot):
-    """A three-joint arm that hangs from a gantry."""
+    """A three-joint arm that hangs from a gantry; its further tasks are ``follow`` and ``fast``."""
 
     def __init__(self, servos: Servos = SERVOS) -> None:
         self.sensor = JointSensor(servos)
@@ -132,6 +142,7 @@ class ArmRobot(Robot):
         self.agent = ServoAgent(servos, TARGET, FEATURES, observe)
         self.model = ServoModel(servos, MJCF, HAND, causes=friction_causes(servos.joints))
         self.task = AimTask(servos, TARGET, reward, success, score)
+        self.tasks = target_tasks(replace(servos, speed=FAST_RAD_S), tip_of, way, (LOW, HIGH), CENTRES)
 
 
 ROBOT = ArmRobot()

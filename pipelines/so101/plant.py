@@ -48,6 +48,7 @@ class SO101Plant(ServoPlant):
         start: Joint angles at the beginning [rad]; default: folded, as it was put away.
         gain: Factor on the servos' gain.
         friction: Factor on dry friction.
+        damping: Factor on what brakes driven servos.
         hand: See ``ServoPlant``.
     """
 
@@ -57,13 +58,14 @@ class SO101Plant(ServoPlant):
         step_s: float = 0.0005,
         gain: float = 1.0,
         friction: float = 1.0,
+        damping: float = 1.0,
         carried_kg: float = 0.0,
         hand: str | None = None,
     ) -> None:
         truth = {
             "gain": gain * _GAIN,
             "limit": [gain * _GAIN * most for most in _SATURATION_RAD],
-            "damping": _DAMPING,
+            "damping": [damping * level for level in _DAMPING],
             "damping_off": _OFF_DAMPING,
             "armature": _ARMATURE,
             "friction": 0.0,

@@ -24,6 +24,7 @@ from sim2real.robots.servo.drive import JointSensor, ServoDrive
 from sim2real.robots.servo.model import Hand, ServoModel, friction_causes, goal_offsets, servo_parameters
 from sim2real.robots.servo.observation import ServoAgent
 from sim2real.robots.servo.servos import Servos
+from sim2real.robots.servo.targets import target_tasks
 from sim2real.robots.servo.task import Aim, AimTask, ServoMoment, uniform
 from sim2real.robots.session import Embedded
 from sim2real.types import Array, Key
@@ -73,6 +74,10 @@ HAND = Hand("wrist_roll", (TIP_M, 0.0, 0.0), most_kg=0.5, least_kg=-0.07)
 """Between the jaws; the link has 87 g."""
 LOW, HIGH = (-0.8, -1.3, 0.5, -1.5, -1.0, -0.5), (0.8, -0.4, 1.4, -1.1, 1.0, 0.5)
 """Joint angles between which targets are drawn [rad]: the arm can reach all of them."""
+CENTRES = (-0.5, -1.1, 0.8, -1.4, 0.0, 0.0), (0.5, -0.7, 1.1, -1.2, 0.0, 0.0)
+"""The same for the centres of figures of eight [rad]."""
+FAST_RAD_S = 4.0
+"""Largest speed of the goals where time counts, near that of a servo without load [rad/s]."""
 FEATURES = (
     ("position", ("rad",) * 6, 5.0),
     ("velocity / 5", ("rad/s",) * 6, 5.0),
@@ -89,7 +94,7 @@ class SO101Robot(Robot):
 
     Its goals stay in a box of joint angles that keeps the arm 4 cm above the table. In a corner of the box it is folded
     away: the upper arm lies back on its stop, the forearm above it, the hand points up. It stays there without torque.
-    From any other pose it sinks to the table when it loses its torque.
+    From any other pose it sinks to the table when it loses its torque. Its further tasks are ``follow`` and ``fast``.
 
     Args:
         calibration: The calibration of the arm on a port; None: the file that `find` returns.
@@ -104,6 +109,7 @@ class SO101Robot(Robot):
         more: dict[str, Any] = {"dynamics": dynamics, "causes": friction_causes(JOINTS)}
         self.model = ServoModel(servos, MJCF, HAND, step_s=STEP_S, **more)
         self.task = AimTask(servos, TARGET, reward, success, score)
+        self.tasks = target_tasks(replace(servos, speed=FAST_RAD_S), tip_of, way, (LOW, HIGH), CENTRES, still=(4, 5))
 
 
 def embedded() -> Embedded:
@@ -164,13 +170,17 @@ def draw_target(key: Key | int) -> Array:
 TARGET = Aim((("target x", "m"), ("target y", "m"), ("target z", "m"), ("opening", "rad")), draw_target)
 
 
+def way(position: Array, gap: Array) -> Any:
+    """Return a distance ``(3,)`` [m] in the frame of the arm at joint angles ``(6,)`` [rad]."""
+    xp = namespace(position, gap)
+    c, s = xp.cos(position[0]), -xp.sin(position[0])  # pan turns clockwise
+    return xp.stack([c * gap[0] + s * gap[1], c * gap[1] - s * gap[0], gap[2]])
+
+
 def observe(reading: JointReading, goal: Array, aim: Array) -> Array:
     """Return ``FEATURES``: the joints, and the way to the target in the frame of the arm."""
     q, xp = reading.position, namespace(reading.position, goal)
-    gap = aim[:3] - tip_of(q)
-    c, s = xp.cos(q[0]), -xp.sin(q[0])  # pan turns clockwise
-    way = xp.stack([c * gap[0] + s * gap[1], c * gap[1] - s * gap[0], gap[2]])
-    return xp.concatenate([q, reading.velocity / 5.0, goal - q, 10.0 * way, aim[3:] - q[5:]])
+    return xp.concatenate([q, reading.velocity / 5.0, goal - q, 10.0 * way(q, aim[:3] - tip_of(q)), aim[3:] - q[5:]])
 
 
 def errors(now: ServoMoment) -> tuple[jax.Array, jax.Array]:

@@ -18,7 +18,7 @@ from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.node import BaseNode, NodeOptions
 from sim2real.robots.loop import SENSOR
 from sim2real.robots.messages import Decision, JointReading
-from sim2real.types import Array, Key, PyTree
+from sim2real.types import Array, Key, PyTree, Scalar
 
 
 @pytree.dataclass
@@ -154,7 +154,8 @@ class GoalAgent(PolicyAgent):
         low: Shape ``(joints,)``: lowest goals [rad].
         high: Shape ``(joints,)``: highest goals [rad].
         features: Features of now: (reading, goals, aim) -> ``(features,)``.
-        aims: Number of entries of the aim.
+        aims: Number of an episode's numbers that the aim depends on: its entries, if it does not move.
+        at: The aim for these numbers and a time [s]; None: they are the aim.
     """
 
     def __init__(
@@ -166,17 +167,18 @@ class GoalAgent(PolicyAgent):
         features: Callable[[JointReading, Array, Array], Array],
         history: int,
         aims: int,
+        at: Callable[[Array, Scalar], Array] | None = None,
         **options: Unpack[NodeOptions],
     ) -> None:
         super().__init__(name, rate, len(low), history, (3 * len(low),), **options)
         self._low, self._high = np.asarray(low, np.float32), np.asarray(high, np.float32)
-        self._features, self._aims = features, aims
+        self._features, self._aims, self._at = features, aims, at
 
     def init_params(self, rng: Key | None = None, graph_state: GraphState | None = None) -> AgentParams:
         return AgentParams(aim=np.zeros(self._aims, np.float32), start=np.zeros_like(self._low))
 
     def features(self, reading: JointReading, step_state: StepState) -> Array:
-        return self._features(reading, step_state.state.command, step_state.params.aim)
+        return self._features(reading, step_state.state.command, self._aim(step_state))
 
     def command(self, before: Array, action: Array) -> Array:
         return namespace(before, action).clip(before + action / self.rate, self._low, self._high)
@@ -185,8 +187,13 @@ class GoalAgent(PolicyAgent):
         return namespace(command, reading.position).concatenate([reading.position, reading.velocity, command])
 
     def message(self, command: Array, step_state: StepState) -> Decision:
-        aim = step_state.params.aim
+        aim = self._aim(step_state)
         return Decision(command, namespace(aim).asarray(aim, np.float32))
+
+    def _aim(self, step_state: StepState) -> Array:
+        """Return the aim at a step; its time is that of the policy's schedule, on the robot as in simulation."""
+        aim = step_state.params.aim
+        return aim if self._at is None else self._at(aim, step_state.seq / self.rate)
 
 
 class DirectAgent(PolicyAgent):

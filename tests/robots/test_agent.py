@@ -155,3 +155,13 @@ def test_a_policy_that_remembers_goes_on_and_begins_anew_with_each_episode(kind)
             sent.append(np.asarray(jax.tree.leaves(message)[0]))
         moved = np.diff([START, *sent], axis=0) * RATE_HZ if kind == "goal" else sent
         np.testing.assert_allclose(moved, np.array([[0.1], [1.1], [2.1]]) * np.ones(2), rtol=1e-4)
+
+
+def test_an_aim_that_moves_is_that_of_the_steps_time():
+    agent = GoalAgent("agent", RATE_HZ, LOW, HIGH, lambda r, g, aim: aim, 0, 2, lambda n, t_s: n[:1] + n[1:] * t_s)
+    step_state, first = started(agent, aim=np.array([0.5, 2.0]))
+    np.testing.assert_allclose(first.aim, [0.5])
+    for k in (0, 25, 100):
+        now = seeing(step_state.replace(seq=k), np.zeros(2), np.zeros(2))
+        np.testing.assert_allclose(agent.observe(now), [0.5 + 2.0 * k / RATE_HZ])
+        np.testing.assert_allclose(agent.act(now, np.zeros(2))[1].aim, [0.5 + 2.0 * k / RATE_HZ])

@@ -54,3 +54,14 @@ def test_the_environment_has_what_is_shown(made):
 def test_a_curriculum_of_nothing_is_refused(prepared):
     with pytest.raises(UsageError, match="all episodes are equal"):
         prepared(curriculum=(0.0, 1.0))
+
+
+def test_ranges_of_both_delays_give_a_data_sheet_delays_and_one_alone_is_refused(prepared):
+    ranges = {"sensor_delay": (0.01, 0.02), "actuator_delay": (0.0, 0.03)}
+    made = prepared(range=ranges)
+    assert sum(made.values[name] for name in ranges) == pytest.approx(0.03)
+    trip = made.episodes.draws["round_trip_delay"]
+    assert 0.01 <= trip.min() < 0.015
+    assert 0.045 < trip.max() <= 0.05
+    with pytest.raises(UsageError, match="actuator_delay"):
+        prepared(range={"sensor_delay": (0.01, 0.02)})

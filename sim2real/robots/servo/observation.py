@@ -58,8 +58,8 @@ class ServoAgent(RobotAgent):
 
     def make(self, rate_hz: float, **options: Unpack[NodeOptions]) -> GoalAgent:
         """Return the policy's node."""
-        s, aims = self._servos, len(self._aim.entries)
-        return GoalAgent(AGENT, rate_hz, s.low, s.high, self.observe, self.history, aims, **options)
+        s, aim = self._servos, self._aim
+        return GoalAgent(AGENT, rate_hz, s.low, s.high, self.observe, self.history, len(aim.draw(0)), aim.at, **options)
 
     def params(self, start: EpisodeStart, policy: PyTree) -> AgentParams:
         """Return the node's parameters: goals start at the joints' positions."""

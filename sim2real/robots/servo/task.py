@@ -15,21 +15,23 @@ from sim2real.robots.messages import EpisodeStart
 from sim2real.robots.robot import RobotTask
 from sim2real.robots.servo.servos import Servos
 from sim2real.training.environment.tasks import Rewards
-from sim2real.types import Array, Key, PyTree
+from sim2real.types import Array, Key, PyTree, Scalar
 
 
 @dataclass(frozen=True)
 class Aim:
-    """The aim of an episode, such as a target's position.
+    """The aim of an episode, such as a target's position, or a target that moves.
 
     Attributes:
         entries: Name and unit of each of the k entries.
-        draw: Returns the aim of an episode ``(k,)``: of training for a key of JAX, of a trial for its number; see
-            ``uniform``.
+        draw: Returns the numbers of an episode ``(m,)``: of training for a key of JAX, of a trial for its number; see
+            ``uniform``. They are the aim itself ``(k,)`` if it does not move.
+        at: Returns the aim ``(k,)`` for an episode's numbers and the time from its start [s]; None: it does not move.
     """
 
     entries: tuple[tuple[str, str], ...]
     draw: Callable[[Key | int], Array]
+    at: Callable[[Array, Scalar], Array] | None = None
 
 
 def uniform(key: Key | int, low: PyTree, high: PyTree) -> Array:
@@ -53,7 +55,7 @@ class ServoMoment(NamedTuple):
     Attributes:
         position: Of the joints ``(joints,)`` [rad].
         velocity: Of the joints ``(joints,)`` [rad/s].
-        aim: The episode's aim ``(k,)``.
+        aim: The aim at this time ``(k,)``.
     """
 
     position: Array
@@ -101,8 +103,10 @@ class AimTask(RobotTask):
         return start.replace(position=position, velocity=start.velocity + velocity)
 
     def judged(self, graph_state: GraphState) -> ServoMoment:
-        state = graph_state.state[WORLD]
-        return ServoMoment(state.position, state.velocity, jnp.asarray(graph_state.params[AGENT].aim))
+        state, aim = graph_state.state[WORLD], jnp.asarray(graph_state.params[AGENT].aim)
+        if self.aim.at is not None:
+            aim = self.aim.at(aim, state.time_s)
+        return ServoMoment(state.position, state.velocity, aim)
 
     def reward(self, state: ServoMoment, action: jax.Array) -> Rewards:
         return {"task": self._reward(state), "speed": -0.01 * jnp.mean((action / self._servos.speed) ** 2)}

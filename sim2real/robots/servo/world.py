@@ -66,6 +66,11 @@ class ServoState(Base):
         """Of the joints ``(joints,)`` [rad/s]."""
         return self.data.qvel[np.array(self.places[1])]
 
+    @property
+    def time_s(self) -> Any:
+        """From the episode's start [s]."""
+        return self.data.time
+
 
 class ServoWorld(BaseWorld):
     """Position servos: torque = gain * (setpoint - angle), within a limit; the input from the actuator has the goals.

@@ -59,9 +59,10 @@ def prepare(
     # Draw parameters and delays.
     has_posterior = identification is not None and identification.posterior is not None
     identified = identification.values if identification and has_posterior else None
-    values = _replaced(
-        robot.nominal() if identified is None else robot.model.unidentified() | identified, changed or {}
-    )
+    usual_values = robot.nominal() if identified is None else robot.model.unidentified() | identified
+    # A data sheet has no delays: ranges of both give the loop delays.
+    ranged = {n: sum(config.vary.range[n]) / 2 for n in DELAYS if n in config.vary.range and n not in usual_values}
+    values = _replaced(usual_values, {**ranged, **(changed or {})})
     rng = np.random.default_rng(config.seed)
     vary, usual = config.vary, defaults_of(robot).train.vary
     vary = vary if identified is None else without_default_ranges(vary, usual, identified)

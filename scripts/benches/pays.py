@@ -1,0 +1,402 @@
+"""What identification is worth to a policy: four ways to train with one budget, judged on the same hidden robots.
+
+    python scripts/bench.py pays --robots arm so101 --jobs 16 --work runs/pays --json reports/pays.json
+
+``data_sheet``: nominal values, no delays. ``wide``: the ranges that an expert would choose, in the report. ``point``:
+identified values and delays. ``posterior``: the same, drawn from their posterior, with model error, timing and noise.
+
+Each seed has a unit of its own: drawn parameters and delays. It is recorded and identified once, and a policy of each
+way is trained with that seed. All four are judged on the unit on several days, each with a load, jitter and pauses of
+the computer of its own, and with the same aims. Loads are drawn from the same range by all ways.
+
+The judge is C MuJoCo with the emulation's servos, on a clock of its own; no code of the training moves it. Every result
+is a file in the folder of --work, and what is there is not computed again: the same command continues.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from benches.hidden import arms, randomise
+from benches.hidden import robots as pendulums
+from benches.jobs import Work, each
+from benches.rows import Report, Row, four_digits, markdown, row, share, values
+
+NOMINAL, IDENTIFIED = ("data_sheet", "wide"), ("point", "posterior")
+WAYS = {
+    "data_sheet": "data sheet, no delays",
+    "wide": "wide ranges, with delays",
+    "point": "identified, one model",
+    "posterior": "identified, posterior and timing",
+}
+LOAD = {"payload": (0.0, arms.MOST_KG)}
+FACTORS: dict[str, dict[str, tuple[float, float]]] = {
+    "pendulum": dict.fromkeys(("gain", "gravity", "damping", "friction"), (0.7, 1.3)),
+    "arm": {"gain": (0.7, 1.3), "damping": (0.5, 2.0), "armature": (0.5, 2.0), "friction": (0.5, 3.0)},
+    "so101": {
+        "gain": (0.7, 1.3),
+        "damping": (0.5, 2.0),
+        "armature": (0.5, 2.0),
+        "friction": (0.3, 4.0),
+        "stribeck": (0.4, 2.0),
+        "saturation": (0.3, 1.2),
+    },
+}
+"""What ``wide`` draws: factors on the data sheet's values, by the beginning of a parameter's name."""
+DELAYS = {"sensor_delay": (0.002, 0.02), "actuator_delay": (0.002, 0.04)}
+"""And delays [s]; those of the pendulum reach to 60 ms together, those of all hidden robots lie within."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A robot of the bench.
+
+    Attributes:
+        tasks: Its tasks.
+        days: On how many days each unit is judged.
+        trials: Deployments on each day.
+        seconds: Length of a deployment [s].
+        record_s: Length of the recording [s].
+        steps: Policy steps of a training.
+    """
+
+    tasks: tuple[str, ...]
+    days: int
+    trials: int
+    seconds: float
+    record_s: float
+    steps: int
+
+
+CASES = {
+    "pendulum": Case(("swing_up",), 1, 10, 8.0, 40.0, 3_000_000),
+    "arm": Case(("follow", "fast"), 4, 3, 4.0, 40.0, 1_500_000),
+    "so101": Case(("follow", "fast"), 4, 3, 4.0, 40.0, 2_000_000),
+}
+FIGURES = {
+    "swing_up": (),
+    "follow": (("error_m", 1e3, "error_mm", "mm"),),
+    "fast": (("settled_s", 1.0, "settled_s", "s"), ("overshoot_m", 1e3, "overshoot_mm", "mm")),
+}
+"""Task -> figures of a deployment beside success and energy: key, factor, name of the row, unit."""
+GOALS = {"follow": ("error_m", "<= 0.75"), "fast": ("settled_s", "<= 0.8")}
+"""Task -> the figure of ``posterior`` over the better one of ``data_sheet`` and ``wide``, and its goal."""
+_ONE = dict.fromkeys(("units", "days", "trials"), 1)
+QUICK = {"robots": ["pendulum"], "tasks": ["swing_up"], "ways": ["data_sheet"], "steps": 512, "envs": 16, **_ONE}
+
+
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of this bench."""
+    parser.add_argument("--robots", nargs="+", default=["arm", "so101"], choices=list(CASES), help="robots")
+    parser.add_argument("--tasks", nargs="+", choices=list(FIGURES), help="tasks; default: all of each robot")
+    parser.add_argument("--ways", nargs="+", default=list(WAYS), choices=list(WAYS), help="ways to train")
+    parser.add_argument("--seeds", "--units", dest="units", type=int, default=5, help="units: one seed each")
+    parser.add_argument("--first", type=int, default=0, help="number of the first unit")
+    parser.add_argument("--days", type=int, help="days on which a unit is judged; default: 4, of a pendulum 1")
+    parser.add_argument("--trials", type=int, help="deployments a day; default: 3, of a pendulum 10")
+    parser.add_argument("--steps", type=int, help="policy steps of each training; default: the robot's own")
+    parser.add_argument("--envs", type=int, default=256, help="copies of a training")
+    parser.add_argument("--work", type=Path, help="folder of the results; what is in it is used again")
+    parser.add_argument("--minutes", type=float, default=1e6, help="time after which nothing new is begun")
+    parser.add_argument("--jobs", type=int, default=1, help="trainings at once, one processor each")
+
+
+def run(options: argparse.Namespace) -> Report:
+    """Identify all units, train and judge what is missing, and return the figures of all results in the folder."""
+    with tempfile.TemporaryDirectory() as scratch:
+        options.folder = options.work or Path(scratch)
+        options.until = time.time() + 60.0 * options.minutes
+        jobs = [
+            (name, task, way, unit)
+            for name in options.robots
+            for task in CASES[name].tasks
+            if task in (options.tasks or FIGURES)
+            for unit in range(options.first, options.first + options.units)
+            for way in options.ways
+        ]
+        jobs = [job for job in jobs if not _file(options, *job).is_file()]
+        needed = dict.fromkeys((name, unit) for name, _, way, unit in jobs if way in IDENTIFIED)
+        missing = [unit for unit in needed if not (_model(options, *unit) / "parameters.json").is_file()]
+        for work, tasks in ((identify, missing), (train_and_judge, jobs)):
+            for i, done in each(partial(_tried, work), tasks, options):
+                print(*tasks[i], done.get("failed", done.get("about", "")), flush=True)
+        results = [json.loads(file.read_text()) for file in sorted(options.folder.glob("*.json"))]
+        models = [json.loads(file.read_text()) for file in sorted(options.folder.glob("*/about.json"))]
+    del options.folder, options.until
+    ranges = {name: wide_ranges(name) for name in options.robots}
+    return {"rows": rows(results), "ranges": ranges, "models": models, "results": results}
+
+
+def _tried(work: Work, *task: Any) -> dict[str, Any]:
+    try:
+        return work(*task)
+    except Exception as error:  # the other results must not be lost
+        print(traceback.format_exc(), file=sys.stderr, flush=True)
+        return {"failed": f"{type(error).__name__}: {error}"}
+
+
+def _file(options: argparse.Namespace, *job: Any) -> Path:
+    return options.folder / f"{'-'.join(map(str, job))}.json"
+
+
+def _model(options: argparse.Namespace, name: str, unit: int) -> Path:
+    return options.folder / f"{name}-{unit}"
+
+
+def identify(name: str, unit: int, options: argparse.Namespace) -> dict[str, Any]:
+    """Record a unit without a load, identify it, and write the identification into the folder."""
+    import sim2real
+    from sim2real.artifacts.recording import Recording
+    from sim2real.stages.load import load_robot
+
+    if time.time() > options.until:
+        return {"about": "not begun: the time is up"}
+    begin, robot, case = time.perf_counter(), load_robot(name), CASES[name]
+    folder = _model(options, name, unit)
+    folder.mkdir(parents=True, exist_ok=True)
+    log = folder / "session.mcap"
+    log.unlink(missing_ok=True)
+    if name == "pendulum":
+        excited = pendulums.excited(case.record_s, unit)
+        pendulums.write(log, pendulums.play(_pendulum(unit), excited, case.record_s, 0))
+    else:
+        arms.record(log, arms.HiddenArm.draw(name, unit, 0), robot, case.record_s)
+    config = replace(robot.defaults.identify, folds=0, seed=unit)
+    found = sim2real.identify(robot, Recording.load(log), config)
+    about = {
+        "robot": name,
+        "unit": unit,
+        "verdict": found.verdict.status,
+        "values": {n: four_digits(v) for n, v in found.values.items()},
+        "identify_s": round(time.perf_counter() - begin, 1),
+        "hidden": _hidden(name, unit),
+    }
+    found.save(folder)
+    (folder / "about.json").write_text(json.dumps(about))
+    return {"about": f"{about['verdict']}, {about['identify_s']} s"}
+
+
+def _pendulum(unit: int) -> pendulums.Hidden:
+    return pendulums.Hidden.draw(unit, randomise.WEAR)
+
+
+def _hidden(name: str, unit: int) -> dict[str, Any]:
+    if name == "pendulum":
+        robot = _pendulum(unit)
+        return {"round_trip_s": four_digits(robot.sensing + robot.acting)}
+    arm = arms.HiddenArm.draw(name, unit, 0)
+    plant = {n: np.round(v, 4).tolist() for n, v in arm.plant.items()}
+    return {"round_trip_s": four_digits(arm.sensing + arm.acting), **plant}
+
+
+def wide_ranges(name: str) -> dict[str, tuple[float, float]]:
+    """Return the ranges of the way ``wide``: parameter -> lowest and highest value."""
+    from sim2real.stages.load import load_robot
+
+    robot: Any = load_robot(name)
+    factors = {n: f for n in robot.nominal() for start, f in FACTORS[name].items() if n.startswith(start)}
+    ranges = {n: tuple(four_digits(robot.nominal()[n] * f) for f in ends) for n, ends in factors.items()}
+    return {**ranges, **DELAYS, **({} if name == "pendulum" else LOAD)}
+
+
+def train_config(robot: Any, way: str, seed: int, options: argparse.Namespace) -> Any:
+    """Return the settings of a training: the robot's own but for what the way draws."""
+    usual = robot.defaults.train
+    load = {} if robot.name == "pendulum" else LOAD
+    vary = {
+        "data_sheet": {"range": load},
+        "wide": {"range": wide_ranges(robot.name)},
+        "point": {"range": load, "noise": 0.0, "pauses": False},
+        "posterior": {"range": load},
+    }[way]
+    few = {"minibatches": 2, "evaluations": 1} if options.envs < usual.ppo.minibatches else {}
+    steps = options.steps or CASES[robot.name].steps
+    return replace(
+        usual,
+        model="nominal" if way in NOMINAL else "identified",
+        randomise=0.0 if way == "point" else 1.0,
+        seed=seed,
+        force=True,
+        sensitivity=False,
+        vary=replace(usual.vary, **vary),
+        ppo=replace(usual.ppo, total_steps=steps, num_envs=options.envs, **few),
+    )
+
+
+def train_and_judge(name: str, task: str, way: str, unit: int, options: argparse.Namespace) -> dict[str, Any]:
+    """Train a policy, judge it on the unit's days, and write the results into the folder."""
+    import sim2real
+    from sim2real.artifacts.identification import Identification
+    from sim2real.stages.load import load_robot
+
+    took = [json.loads(f.read_text())["train_s"] for f in options.folder.glob(f"{name}-*.json")]
+    if time.time() + max(took, default=0.0) > options.until:
+        return {"about": "not begun: the time is up"}
+    robot: Any = load_robot(name)
+    robot = robot if name == "pendulum" else robot.with_task(task)
+    model = Identification.load(_model(options, name, unit)) if way in IDENTIFIED else None
+    begin = time.perf_counter()
+    bundle = sim2real.train(robot, model, train_config(robot, way, unit, options))
+    train_s = time.perf_counter() - begin
+    trials = _judged(name, task, robot, bundle, unit, options)
+    history = bundle.history
+    result = {
+        "robot": name,
+        "task": task,
+        "way": way,
+        "unit": unit,
+        "train_s": round(train_s, 1),
+        "in_simulation": np.round(np.asarray(history.success).max(axis=1), 3).tolist() if history else [],
+        "trials": [{n: four_digits(v) for n, v in trial.items()} for trial in trials],
+    }
+    file = _file(options, name, task, way, unit)
+    partly = file.with_suffix(".part")
+    partly.write_text(json.dumps(result))
+    partly.rename(file)
+    means = {n: float(np.nanmean([t[n] for t in trials])) for n in trials[0] if n not in ("day", "trial")}
+    return {"about": f"{train_s:.0f} s " + ", ".join(f"{n} {v:.4g}" for n, v in means.items())}
+
+
+def _judged(
+    name: str, task: str, robot: Any, bundle: Any, unit: int, options: argparse.Namespace
+) -> list[dict[str, float]]:
+    """Return the figures of all deployments of a policy."""
+    from sim2real.policy.bundle import make_runner
+
+    case = CASES[name]
+    results = []
+    for day in range(options.days or case.days):
+        for trial in range(options.trials or case.trials):
+            if name == "pendulum":
+                wear = argparse.Namespace(volts=2.0, seconds=case.seconds)
+                session = 1 + 100 * day + trial
+                up = randomise.upright(*randomise.played(_pendulum(unit), bundle, wear, session), np.inf)
+                figures = {"success": float(up >= randomise.UPRIGHT)}
+            else:
+                runner = make_runner(bundle.weights, bundle.contract, None, bundle.spec, bundle.graph)
+                arm = arms.HiddenArm.draw(name, unit, day)
+                number = 10 * day + trial
+                act = arms.agent(robot, runner, number)
+                figures = arms.judge(arm, robot, task, act, number, case.seconds)
+            results.append({"day": day, "trial": trial, **figures})
+    return results
+
+
+# -- the report
+
+
+def rows(results: list[dict[str, Any]]) -> list[Row]:
+    """Return the figures of each robot, task and way; each is a mean over the seeds' means, with the seeds' ends."""
+    lines = []
+    for name, task in dict.fromkeys((r["robot"], r["task"]) for r in results):
+        of = {w: [r for r in results if (r["robot"], r["task"], r["way"]) == (name, task, w)] for w in WAYS}
+        means: dict[tuple[str, str], dict[int, float]] = {}
+        for way, found in ((way, found) for way, found in of.items() if found):
+            prefix = f"pays/{name}/{task}/{way}"
+            good = [t["success"] for r in found for t in r["trials"]]
+            if task == "follow":  # a share of the time, not of the deployments
+                lines.append(row(f"{prefix}/success", four_digits(float(np.mean(good))), "share of the time"))
+            else:
+                value, low, high = share(round(sum(good)), len(good))
+                about = f"95 %: {low:.3f} to {high:.3f}"
+                lines.append(row(f"{prefix}/success", four_digits(value), f"of {len(good)} deployments", about))
+            energy = (("energy_j", 1.0, "energy_j", "J"),) * ("energy_j" in found[0]["trials"][0])
+            for key, factor, label, unit in (*FIGURES[task], *energy):
+                by_seed = {r["unit"]: factor * float(np.nanmean([t[key] for t in r["trials"]])) for r in found}
+                means[way, key] = by_seed
+                ends = f"{len(by_seed)} seeds: {min(by_seed.values()):.4g} to {max(by_seed.values()):.4g}"
+                mean = four_digits(float(np.mean(list(by_seed.values()))))
+                lines.append(row(f"{prefix}/{label}", mean, unit, ends))
+            lines.append(row(f"{prefix}/train_s", four_digits(float(np.mean([r["train_s"] for r in found]))), "s"))
+        if task in GOALS:
+            lines += ratios(f"pays/{name}/{task}", means, *GOALS[task])
+    return lines
+
+
+def ratios(prefix: str, means: Mapping[tuple[str, str], Mapping[int, float]], key: str, goal: str) -> list[Row]:
+    """Return the figure of ``posterior`` over that of the better one of ``data_sheet`` and ``wide``."""
+    there = {way: means[way, key] for way in WAYS if (way, key) in means}
+    others = {way: float(np.mean(list(there[way].values()))) for way in NOMINAL if way in there}
+    if "posterior" not in there or not others:
+        return []
+    best = min(others, key=lambda way: others[way])
+    ours = there["posterior"]
+    value = float(np.mean(list(ours.values()))) / others[best]
+    by_seed = [ours[unit] / there[best][unit] for unit in sorted(set(ours) & set(there[best]))]
+    better = sum(ratio < 1.0 for ratio in by_seed)
+    about = f"over {best}; better with {better} of {len(by_seed)} seeds, {min(by_seed):.2f} to {max(by_seed):.2f}"
+    return [row(f"{prefix}/identified_over_best", four_digits(value), "", about, goal)]
+
+
+TASKS = {
+    ("pendulum", "swing_up"): ("pendulum, swing up: success", "success", 100.0, "%"),
+    ("arm", "follow"): ("arm, figure of eight: error", "error_mm", 1.0, "mm"),
+    ("arm", "fast"): ("arm, time to stay within 1 cm", "settled_s", 1.0, "s"),
+    ("so101", "follow"): ("SO-101, figure of eight: error", "error_mm", 1.0, "mm"),
+    ("so101", "fast"): ("SO-101, time to stay within 1 cm", "settled_s", 1.0, "s"),
+}
+"""Robot and task -> what a table and a figure show: label, row, factor, unit."""
+
+
+def _shown(reports: tuple[Report, ...]) -> dict[tuple[str, str], dict[str, Row]]:
+    """Return the rows that are shown: robot and task -> way -> row."""
+    found = {line["name"]: line for report in reports for line in report["rows"]}
+    return {
+        of: ways
+        for of, (_, figure, _, _) in TASKS.items()
+        if (ways := {w: found[n] for w in WAYS if (n := f"pays/{'/'.join(of)}/{w}/{figure}") in found})
+    }
+
+
+def table(*reports: Report) -> str:
+    """Return the table: a row for each robot and task, the four ways, and identification over the better of others."""
+    ratio = {}
+    for report in reports:
+        ratio |= {n: v for n, v in values(report, "pays/").items() if n.endswith("identified_over_best")}
+    lines = []
+    for of, ways in _shown(reports).items():
+        label, _, factor, unit = TASKS[of]
+        cells = [_cell(ways.get(way), factor, unit) for way in WAYS]
+        over = ratio.get(f"{'/'.join(of)}/identified_over_best")
+        lines.append((label, *cells, "" if over is None else f"{over:.2f}"))
+    return markdown(("hidden robots", *WAYS.values(), "the last over the better of the first two"), lines)
+
+
+def _cell(line: Row | None, factor: float, unit: str) -> str:
+    if line is None:
+        return ""
+    ends = line["yardstick"].rpartition(": ")[2]
+    ends = " to ".join(f"{factor * float(end):.3g}" for end in ends.split(" to ")) if " to " in ends else ends
+    return f"{factor * line['value']:.3g} {unit} ({ends})"
+
+
+def figure(*reports: Report) -> Figure:
+    """Return README's figure: each robot and task with the four ways, and the ends of seeds or of the interval."""
+    shown = _shown(reports)
+    drawn = Figure((8.2, 2.6), layout="constrained")
+    for axes, (of, ways) in zip(drawn.subplots(1, len(shown), squeeze=False)[0], shown.items(), strict=True):
+        label, _, factor, unit = TASKS[of]
+        for i, (way, line) in enumerate(ways.items()):
+            low, high = (factor * float(end) for end in line["yardstick"].rpartition(": ")[2].split(" to "))
+            value = factor * line["value"]
+            axes.bar(i, value, 0.7, yerr=[[value - low], [high - value]], capsize=3, label=WAYS[way], color=f"C{i}")
+        name, _, what = label.partition(", ")
+        axes.set(title=f"{name}\n{what} [{unit}]", xticks=[], ylim=(0, None))
+        axes.title.set_fontsize(8)
+        axes.spines[["top", "right"]].set_visible(False)
+    handles, labels = drawn.axes[0].get_legend_handles_labels()
+    drawn.legend(handles, labels, loc="outside lower center", ncols=2)
+    return drawn
