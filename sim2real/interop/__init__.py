@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
     from gymnasium.vector import AutoresetMode
@@ -23,21 +23,10 @@ if TYPE_CHECKING:
     Source = str | Path | Robot
     """A run folder, or a robot or the name of its pipeline; of these the newest identification is taken."""
 
-Model = Literal["identified", "nominal"]
-
-
-class Options(TypedDict, total=False):
-    """Options of ``robot_environment``."""
-
-    model: Model
-    values: Mapping[str, float] | None
-    config: TrainConfig | None
-    runs: Path | str
-
 
 def robot_environment(
     source: Source,
-    model: Model = "identified",
+    model: Literal["identified", "nominal"] = "identified",
     values: Mapping[str, float] | None = None,
     config: TrainConfig | None = None,
     runs: Path | str = "runs",
@@ -81,29 +70,24 @@ def robot_environment(
 
 
 def vector_env(
-    source: Source | RobotEnvironment,
-    num_envs: int,
-    autoreset_mode: AutoresetMode | str = "NextStep",
-    **options: Unpack[Options],
+    source: Source | RobotEnvironment, num_envs: int, autoreset_mode: AutoresetMode | str = "NextStep", **options: Any
 ) -> CopiesVectorEnv:
     """Return copies of a robot as a ``gymnasium.vector.VectorEnv``.
 
     Args:
-        source: See ``robot_environment``; or its result.
-        autoreset_mode: When a copy that is done is reset: ``NextStep``, ``SameStep`` or ``Disabled``.
+        source: See ``robot_environment``, which ``options`` go to as well; or its result.
+        autoreset_mode: When a copy that is done is reset: ``NextStep`` or ``SameStep``.
     """
     from sim2real.interop.vector import CopiesVectorEnv
 
     return CopiesVectorEnv(_environment(source, options), num_envs, autoreset_mode)
 
 
-def baselines_env(
-    source: Source | RobotEnvironment, num_envs: int, seed: int | None = None, **options: Unpack[Options]
-) -> Any:
+def baselines_env(source: Source | RobotEnvironment, num_envs: int, seed: int | None = None, **options: Any) -> Any:
     """Return copies of a robot as a ``VecEnv`` of Stable-Baselines3.
 
     Args:
-        source: See ``robot_environment``; or its result.
+        source: See ``robot_environment``, which ``options`` go to as well; or its result.
         seed: Seed of the episodes; default: a random one.
     """
     from sim2real.interop.baselines import to_baselines
@@ -111,18 +95,18 @@ def baselines_env(
     return to_baselines(vector_env(source, num_envs, "SameStep", **options), seed)
 
 
-def brax_env(source: Source | RobotEnvironment, **options: Unpack[Options]) -> BraxEnv:
+def brax_env(source: Source | RobotEnvironment, **options: Any) -> BraxEnv:
     """Return a robot as a ``brax.envs.Env``.
 
     Args:
-        source: See ``robot_environment``; or its result.
+        source: See ``robot_environment``, which ``options`` go to as well; or its result.
     """
     from sim2real.interop.brax import BraxEnv
 
     return BraxEnv(_environment(source, options))
 
 
-def _environment(source: Source | RobotEnvironment, options: Options) -> RobotEnvironment:
+def _environment(source: Source | RobotEnvironment, options: dict[str, Any]) -> RobotEnvironment:
     from sim2real.interop.robot import RobotEnvironment
 
     return source if isinstance(source, RobotEnvironment) else robot_environment(source, **options)

@@ -43,19 +43,17 @@ def to_baselines(env: CopiesVectorEnv, seed: int | None = None) -> Any:
         ) from error
 
     # The adapter's class inherits from theirs, so it is made here.
-    kind: Any = type("BaselinesVecEnv", (_Copies, base), {})
-    adapted = kind(env.num_envs, env.single_observation_space, env.single_action_space)
-    adapted.env = env
-    adapted.seed(seed)
-    return adapted
+    adapted: Any = type("BaselinesVecEnv", (_Copies, base), {"env": env, "_seed": seed})
+    return adapted(env.num_envs, env.single_observation_space, env.single_action_space)
 
 
 class _Copies:
-    """The methods that Stable-Baselines3 calls."""
+    """The methods that Stable-Baselines3 calls; all copies run in one program, and have no attributes of their own."""
 
     env: CopiesVectorEnv
     num_envs: int
     render_mode = None
+    _seed: int | None
 
     def seed(self, seed: int | None = None) -> list[int | None]:
         """Set the seed of the next reset; copy i has ``seed + i``."""
@@ -63,49 +61,39 @@ class _Copies:
         return [None if seed is None else seed + i for i in range(self.num_envs)]
 
     def reset(self) -> np.ndarray:
-        """Start all copies."""
         observation, _ = self.env.reset(seed=self._seed)
         self._seed = None
         return observation
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Keep the actions for ``step_wait``."""
         self._actions = actions
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, PyTree]]]:
-        """Step all copies."""
         observation, reward, terminated, truncated, infos = self.env.step(self._actions)
         done = terminated | truncated
         copy_infos: list[dict[str, PyTree]] = [{"TimeLimit.truncated": bool(cut)} for cut in truncated]
         for i in np.flatnonzero(done):
-            final = infos["final_info"]
             copy_infos[i]["terminal_observation"] = infos["final_obs"][i]
-            copy_infos[i] |= {name: value[i] for name, value in final.items() if not name.startswith("_")}
+            copy_infos[i] |= {n: value[i] for n, value in infos["final_info"].items() if not n.startswith("_")}
         return observation, reward.astype(np.float32), done, copy_infos
 
     def close(self) -> None:
-        """Close the environment."""
         self.env.close()
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[object]:
-        """Return an attribute of the environment, once for each of some copies."""
         owner = self if attr_name == "render_mode" else self.env
-        return [getattr(owner, attr_name) for _ in self._selected(indices)]
+        return self._for_each(getattr(owner, attr_name), indices)
 
     def set_attr(self, attr_name: str, value: object, indices: Indices = None) -> None:
-        """Refuse: all copies run in one program, and have no attributes of their own."""
         raise UsageError(f"copies have no attributes of their own: {attr_name!r} cannot be set")
 
     def env_method(self, method_name: str, *args: object, indices: Indices = None, **options: object) -> list[object]:
-        """Call a method of the environment once, and return its result for each of some copies."""
-        result = getattr(self.env, method_name)(*args, **options)
-        return [result for _ in self._selected(indices)]
+        return self._for_each(getattr(self.env, method_name)(*args, **options), indices)
 
-    def env_is_wrapped(self, wrapper_class: type, indices: Indices = None) -> list[bool]:
-        """Return that no copy is wrapped."""
-        return [False for _ in self._selected(indices)]
+    def env_is_wrapped(self, wrapper_class: type, indices: Indices = None) -> list[object]:
+        return self._for_each(False, indices)
 
-    def _selected(self, indices: Indices) -> Iterable[int]:
+    def _for_each(self, value: object, indices: Indices) -> list[object]:
         if indices is None:
-            return range(self.num_envs)
-        return [indices] if isinstance(indices, int) else indices
+            return [value] * self.num_envs
+        return [value for _ in ([indices] if isinstance(indices, int) else indices)]

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from sim2real.composer.mjx_environment import MjxEnvironment, State
+from sim2real.composer.mjx_environment import MjxEnvironment
 from sim2real.errors import Sim2RealError
 from sim2real.installation import with_extra
-from sim2real.interop.robot import Copy, RobotEnvironment, specs_of
+from sim2real.interop.robot import RobotEnvironment, specs_of
 
 try:
     from brax.envs.base import Env
@@ -55,20 +55,23 @@ class BraxEnv(Env):
     def __init__(self, environment: MjxEnvironment | RobotEnvironment) -> None:
         self.environment: PyTree = environment
         observation, action = specs_of(environment)
-        shapes = observation.values() if isinstance(observation, dict) else [observation]
-        self._sizes = sum(math.prod(spec.shape) for spec in shapes), math.prod(action.shape)
+        shapes = observation.values() if isinstance(observation, Mapping) else [observation]
+        self.observation_size = sum(math.prod(spec.shape) for spec in shapes)
+        self.action_size = math.prod(action.shape)
         self.max_episode_length = environment.step_limit
-        self._middle: PyTree = 0.0
-        self._half: PyTree = 1.0
+        self.backend = "mjx"  # in brax's terms: an engine other than brax's
+        self._middle: PyTree = None
         if isinstance(environment, RobotEnvironment):
-            low, high = np.array([(e.low, e.high) for e in environment.action], np.float32).T
-            self._middle, self._half = (high + low) / 2, (high - low) / 2
+            self.dt = 1.0 / environment.rate_hz
+            self._middle, self._half = (action.maximum + action.minimum) / 2, (action.maximum - action.minimum) / 2
+        else:
+            self.dt = environment.task.control_timestep
 
     def reset(self, rng: Key) -> BraxState:
         """Return a copy at the start of an episode."""
         rng, key = jax.random.split(rng)
         copy = self.environment.reset(rng)
-        return self._brax_state(copy, copy.reward, {"key": key}, {})
+        return _brax_state(copy, copy.reward, {"key": key}, {})
 
     def step(self, state: BraxState, action: jax.Array) -> BraxState:
         """Return the copy one step later."""
@@ -78,51 +81,26 @@ class BraxEnv(Env):
         if _FIRST_STATE in info:
             fresh = self.environment.reset(key)
             info |= {_FIRST_STATE: fresh, _FIRST_OBSERVATION: _vector(fresh)}
-        if isinstance(self.environment, RobotEnvironment):
+        if self._middle is not None:
             action = self._middle + self._half * jnp.clip(action, -1.0, 1.0)
         copy = self.environment.step(before, action)
         # An episode that goes on past its time limit must not train a policy without notice.
         reward = jnp.where(before.truncated, jnp.nan, copy.reward)
-        return self._brax_state(copy, reward, info, state.metrics)
-
-    def _brax_state(
-        self, copy: State | Copy, reward: jax.Array, info: dict[str, jax.Array], metrics: dict[str, jax.Array]
-    ) -> BraxState:
-        dtype = reward.dtype
-        done = copy.done & ~copy.truncated if _STEPS in info else copy.done
-        info |= {"truncation": copy.truncated.astype(dtype)}
-        if isinstance(copy, State):
-            info |= {"discount": copy.discount.astype(dtype), "failed": copy.failed.astype(dtype)}
-        else:  # brax's wrappers add metrics of their own, which stay
-            metrics = metrics | {n: jnp.where(copy.done, v, 0.0) for n, v in copy.values.items()}
-        state: PyTree = copy
-        return BraxState(state, _vector(copy), reward, done.astype(dtype), metrics, info)
-
-    @property
-    def observation_size(self) -> int:
-        """Length of an observation."""
-        return self._sizes[0]
-
-    @property
-    def action_size(self) -> int:
-        """Length of an action."""
-        return self._sizes[1]
-
-    @property
-    def backend(self) -> str:
-        """The engine, in brax's terms: ``mjx`` means an engine other than brax's."""
-        return "mjx"
-
-    @property
-    def dt(self) -> float:
-        """Time between two actions [s]."""
-        environment = self.environment
-        if isinstance(environment, RobotEnvironment):
-            return 1.0 / environment.rate_hz
-        return environment.task.control_timestep
+        return _brax_state(copy, reward, info, state.metrics)
 
 
-def _vector(copy: State | Copy) -> jax.Array:
+def _brax_state(copy: PyTree, reward: jax.Array, info: dict[str, jax.Array], metrics: dict[str, jax.Array]) -> BraxState:
+    """Return the state of a copy of a task, which has a discount, or of a robot, which has values of its episode."""
+    dtype = reward.dtype
+    done = copy.done & ~copy.truncated if _STEPS in info else copy.done
+    info |= {"truncation": copy.truncated.astype(dtype)}
+    info |= {n: getattr(copy, n).astype(dtype) for n in ("discount", "failed") if hasattr(copy, n)}
+    of_episode = getattr(copy, "values", {})  # brax's wrappers add metrics of their own, which stay
+    metrics = metrics | {n: jnp.where(copy.done, v, 0.0) for n, v in of_episode.items()}
+    return BraxState(copy, _vector(copy), reward, done.astype(dtype), metrics, info)
+
+
+def _vector(copy: PyTree) -> jax.Array:
     """Return an observation as one vector."""
     observation = copy.observation
     if not isinstance(observation, dict):

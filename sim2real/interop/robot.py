@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import jax
@@ -14,17 +13,16 @@ from dm_env import specs
 
 from sim2real.composer.mjx_environment import MjxEnvironment
 from sim2real.errors import UsageError
-from sim2real.policy.contract import PolicyContract
+from sim2real.policy.contract import ActionTerm, PolicyContract
 from sim2real.training.environment.graph_environment import EnvState, GraphEnvironment
 from sim2real.training.environment.protocol import Step, choose
 
 if TYPE_CHECKING:
-    from sim2real.types import Key
+    from sim2real.types import Key, PyTree
 
 
-@dataclass(frozen=True)
-class Entry:
-    """One number of an observation or an action.
+class Entry(NamedTuple):
+    """One number of an observation.
 
     Attributes:
         name: E.g. ``past voltage[0][2]``: the term, its age in steps, and the entry of that term.
@@ -81,16 +79,13 @@ class RobotEnvironment:
 
     def __init__(self, env: GraphEnvironment, contract: PolicyContract) -> None:
         self.env, self.rate_hz = env, contract.rate_hz
-        bounds = [
-            (unit, low, high)
-            for term in contract.observation
-            for _ in range(term.history)
-            for unit, low, high in zip(
-                term.units, term.low or (-math.inf,) * term.size, term.high or (math.inf,) * term.size, strict=True
-            )
-        ]
-        self.observation = tuple(Entry(n, *rest) for n, rest in zip(contract.observation_names, bounds, strict=True))
-        self.action = tuple(Entry(term.name, term.unit, term.low, term.high) for term in contract.action)
+        names, entries = iter(contract.observation_names), []
+        for term in contract.observation:
+            low, high = term.low or (-math.inf,) * term.size, term.high or (math.inf,) * term.size
+            numbers = list(zip(term.units, low, high, strict=True))
+            entries += [Entry(next(names), *number) for _ in range(term.history) for number in numbers]
+        self.observation = tuple(entries)
+        self.action = contract.action
         if len(self.observation) != env.observation_size:
             raise UsageError(
                 f"the robot's observation terms have {len(self.observation)} entries, its task shows "
@@ -108,6 +103,14 @@ class RobotEnvironment:
         self._last = turns.shape[1] - 1 - np.argmax(turns[:, ::-1], axis=1)
         self._rows_before = int(np.argmax(turns, axis=1).max())
         self._rows_between = max(int(np.diff(np.flatnonzero(t)).max()) for t in turns) - 1
+
+    def observation_spec(self) -> specs.BoundedArray:
+        """Return shape, dtype and bounds of an observation."""
+        return _bounded(self.observation)
+
+    def action_spec(self) -> specs.BoundedArray:
+        """Return shape, dtype and bounds of an action."""
+        return _bounded(self.action)
 
     def reset(self, key: Key) -> Copy:
         """Return a copy at the start of an episode, at the policy's first step."""
@@ -146,33 +149,29 @@ class RobotEnvironment:
         return Copy(made.state, next_key, made.observation, jnp.asarray(made.reward, jnp.float32), *ends, made.metrics)
 
 
-def specs_of(
-    environment: MjxEnvironment | RobotEnvironment,
-) -> tuple[specs.Array | dict[str, specs.Array], specs.Array]:
+def specs_of(environment: MjxEnvironment | RobotEnvironment) -> tuple[PyTree, specs.Array]:
     """Return shape, dtype and bounds of an observation, of a composed task by name, and of an action.
 
     Raises:
         UsageError: When no observable of a task is enabled, or an action is not one array.
     """
-    if isinstance(environment, RobotEnvironment):
-        return _bounded(environment.observation), _bounded(environment.action)
-    task, shapes = environment.task, environment.observation_spec()
-    if not shapes:
-        available = ", ".join(map(repr, task.observables)) or "none"
+    observation, action = environment.observation_spec(), environment.action_spec()
+    if isinstance(environment, MjxEnvironment) and not observation:
+        task = environment.task
         raise UsageError(
-            f"task {type(task).__name__} shows its policy nothing: no observable is enabled. There are: {available}",
+            f"task {type(task).__name__} shows its policy nothing: no observable is enabled. There are: "
+            f"{', '.join(map(repr, task.observables)) or 'none'}",
             hint="set `enabled = True` for the observables of the policy; a robot with its delays comes from "
             "sim2real.interop",
         )
-    action = environment.action_spec()
     if not isinstance(action, specs.Array):
         raise UsageError(
             f"an action must be one array, and the task's action_spec is {action!r}",
             hint="override action_spec in the task",
         )
-    return {name: specs.Array(s.shape, s.dtype) for name, s in shapes.items()}, action
+    return observation, action
 
 
-def _bounded(entries: Sequence[Entry]) -> specs.BoundedArray:
+def _bounded(entries: Sequence[Entry | ActionTerm]) -> specs.BoundedArray:
     low, high = np.array([(e.low, e.high) for e in entries], np.float32).T
     return specs.BoundedArray((len(entries),), np.float32, low, high)
