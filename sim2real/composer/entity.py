@@ -49,7 +49,26 @@ class FreePropObservableMixin(ABC):
         """Angular velocity ``(3,)`` [rad/s]."""
 
 
-class Entity(ABC):
+class WithHooks(ABC):  # noqa: B024
+    """What runs at set times of an episode, of entities and of tasks; nothing, unless a subclass overrides it."""
+
+    def initialize_episode_mjcf(self, random_state: RandomState) -> None:  # noqa: B027
+        """Change the models before they are compiled for an episode."""
+
+    def after_compile(self, physics: BasePhysics, random_state: RandomState) -> None:  # noqa: B027
+        """Look at the compiled model."""
+
+    def initialize_episode(self, physics: BasePhysics, random_state: RandomState) -> None:  # noqa: B027
+        """Set the state at the start of an episode."""
+
+    def after_substep(self, physics: BasePhysics, random_state: RandomState) -> None:  # noqa: B027
+        """Act after a step of the physics."""
+
+    def after_step(self, physics: BasePhysics, random_state: RandomState) -> None:  # noqa: B027
+        """Act after a control step."""
+
+
+class Entity(WithHooks):
     """A part of a world: a model, observables, and hooks that run at set times of an episode.
 
     Subclasses override ``_build``, not the constructor.
@@ -142,28 +161,13 @@ class Entity(ABC):
             parent._attached.remove(self)
         self._parent = None
 
-    # -- hooks: they do nothing unless a subclass overrides them
+    # -- hooks that get no action, unless they ask for it by a third parameter
 
-    def initialize_episode_mjcf(self, random_state: RandomState) -> None:  # noqa: B027
-        """Change the model before it is compiled for an episode."""
-
-    def after_compile(self, physics: BasePhysics, random_state: RandomState) -> None:  # noqa: B027
-        """Look at the compiled model."""
-
-    def initialize_episode(self, physics: BasePhysics, random_state: RandomState) -> None:  # noqa: B027
-        """Set the state at the start of an episode."""
-
-    def before_step(self, physics: BasePhysics, random_state: RandomState) -> None:  # noqa: B027
+    def before_step(self, physics: BasePhysics, random_state: RandomState) -> None:
         """Act before a control step."""
 
-    def before_substep(self, physics: BasePhysics, random_state: RandomState) -> None:  # noqa: B027
+    def before_substep(self, physics: BasePhysics, random_state: RandomState) -> None:
         """Act before a step of the physics."""
-
-    def after_substep(self, physics: BasePhysics, random_state: RandomState) -> None:  # noqa: B027
-        """Act after a step of the physics."""
-
-    def after_step(self, physics: BasePhysics, random_state: RandomState) -> None:  # noqa: B027
-        """Act after a control step."""
 
     # -- poses and frames
 

@@ -249,16 +249,6 @@ class Environment(dm_env.Environment):
         spec = self._task.get_discount_spec()
         return super().discount_spec() if spec is None else spec
 
-    def step_spec(self) -> dm_env.TimeStep:
-        """Return the specs of a time step; deprecated, ask for them one by one."""
-        warnings.warn(
-            "`step_spec` is deprecated: use `reward_spec` and `discount_spec`", DeprecationWarning, stacklevel=2
-        )
-        if self._task.get_reward_spec() is None or self._task.get_discount_spec() is None:
-            raise NotImplementedError("the task declares no reward and discount specs")
-        step_type: PyTree = None
-        return dm_env.TimeStep(step_type, self.reward_spec(), self.discount_spec(), self.observation_spec())
-
     def close(self) -> None:
         """Free the physics."""
         self._drop()

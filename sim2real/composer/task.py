@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
 from functools import reduce
@@ -15,7 +15,7 @@ from dm_env import specs
 
 from sim2real.composer import define
 from sim2real.composer.arena import Arena
-from sim2real.composer.entity import Entity
+from sim2real.composer.entity import Entity, WithHooks
 from sim2real.composer.observation.observable.base import Generic
 from sim2real.composer.physics.layout import names_of
 from sim2real.errors import UsageError
@@ -65,7 +65,7 @@ def split_reward(reward: PyTree) -> tuple[PyTree, dict[str, PyTree]]:
     return reduce(add, reward.values()), dict(reward)
 
 
-class Task(ABC):
+class Task(WithHooks):
     """Reward, termination and the initial state of an episode, in a world of entities."""
 
     _root_entity: Entity | None = None
@@ -165,28 +165,13 @@ class Task(ABC):
 
     # -- hooks
 
-    def initialize_episode_mjcf(self, random_state: RandomState) -> None:  # noqa: B027
-        """Change the models before they are compiled for an episode."""
-
-    def after_compile(self, physics: BasePhysics, random_state: RandomState) -> None:  # noqa: B027
-        """Look at the compiled model."""
-
-    def initialize_episode(self, physics: BasePhysics, random_state: RandomState) -> None:  # noqa: B027
-        """Set the state at the start of an episode."""
-
     def before_step(self, physics: BasePhysics, action: PyTree, random_state: RandomState) -> None:
         """Act before a control step; default: the action, shape ``(nu,)``, becomes the control."""
         del random_state
         physics.set_control(action)
 
-    def before_substep(self, physics: BasePhysics, action: PyTree, random_state: RandomState) -> None:  # noqa: B027
+    def before_substep(self, physics: BasePhysics, action: PyTree, random_state: RandomState) -> None:
         """Act before a step of the physics."""
-
-    def after_substep(self, physics: BasePhysics, random_state: RandomState) -> None:  # noqa: B027
-        """Act after a step of the physics."""
-
-    def after_step(self, physics: BasePhysics, random_state: RandomState) -> None:  # noqa: B027
-        """Act after a control step."""
 
     @abstractmethod
     def get_reward(self, physics: BasePhysics) -> PyTree:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import collections
 import contextlib
-import enum
 import functools
+import io
+import pickle
 import random
 import traceback
 from collections.abc import Callable, Iterable, Iterator
@@ -18,6 +18,7 @@ from jax.core import Tracer
 
 from sim2real.composer.define import cached_property
 from sim2real.composer.hooks import Hooks
+from sim2real.composer.physics.mjx.physics import SET_BEFORE
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
@@ -26,8 +27,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 _KEEP = "keep what changes in physics.variables[{name!r}], which belongs to each copy; set what does not in __init__"
-_DEPTH = 6
-_LIBRARIES = ("sim2real", "mujoco", "jax", "jaxlib", "numpy", "dm_env", "brax", "builtins", "functools", "weakref")
+_LIBRARIES = ("sim2real", "mujoco", "jax", "jaxlib", "dm_env", "brax", "functools", "weakref")
 _UNKNOWN = "while the program is made, values of the simulation do not exist"
 _WORDS: tuple[tuple[type[Exception], str, str, str], ...] = (
     (
@@ -72,8 +72,16 @@ _WORDS: tuple[tuple[type[Exception], str, str, str], ...] = (
         "arrays of compiled programs cannot be written into",
         "use physics.write(element, 'qpos', value, index), or array = array.at[index].set(value)",
     ),
+    (
+        ValueError,
+        "writes into an array of the compiled model",
+        "it is one of the program's constants",
+        SET_BEFORE,
+    ),
 )
 """Error of JAX -> what the function did, why that does not work, what to do instead."""
+_IN_TEXT = {TypeError: "item assignment", ValueError: "read-only"}
+"""Words in the text of errors that are these ones."""
 
 
 @contextlib.contextmanager
@@ -83,7 +91,7 @@ def named(label: str) -> Iterator[None]:
         yield
     except Exception as error:
         for kind, what, why, hint in _WORDS:
-            if isinstance(error, kind) and (kind is not TypeError or "item assignment" in str(error)):
+            if isinstance(error, kind) and _IN_TEXT.get(kind, "") in str(error):
                 raise UsageError(f"{label} {what}{_line(error)}: {why}", hint=hint) from error
         raise
 
@@ -155,53 +163,30 @@ def _compare(label: str, owner: object, before: dict[str, object], after: dict[s
 
 
 def _attributes(owner: object) -> dict[str, object]:
-    visited: set[int] = {id(owner)}
-    return {k: _fingerprint(v, visited) for k, v in vars(owner).items() if not _is_cache(type(owner), k)}
+    return {k: _fingerprint(v) for k, v in vars(owner).items() if not _is_cache(type(owner), k)}
 
 
 def _is_cache(owner: type, name: str) -> bool:
     return isinstance(getattr(owner, name, None), functools.cached_property | cached_property)
 
 
-class _Same:
-    """An object, compared by identity."""
+class _Fingerprint(pickle.Pickler):
+    """Writes containers, arrays and a program's own objects by their contents, all else by its identity."""
 
-    def __init__(self, value: object) -> None:
-        self.value = value
+    def persistent_id(self, value: object) -> int | None:
+        package = type(value).__module__.partition(".")[0]
+        by_identity = package in _LIBRARIES or isinstance(value, type) or callable(value)
+        return id(value) if by_identity else None
 
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and self.value is other.value
 
-
-def _fingerprint(value: object, visited: set[int] | None = None, depth: int = 0) -> object:
-    """Return a fingerprint of a value that changes with it: the contents of containers and of a program's objects."""
-    visited = set() if visited is None else visited
-    if value is None or isinstance(value, bool | int | float | complex | str | bytes | enum.Enum | np.generic):
-        return type(value).__name__, repr(value)
-    if isinstance(value, np.ndarray):
-        return (value.shape, value.dtype.str, value.tobytes()) if value.dtype != object else _Same(value)
-    if isinstance(value, np.random.RandomState):
-        return _numbers(value.get_state())
-    if isinstance(value, np.random.Generator):
-        return repr(value.bit_generator.state)
-    # Compare deep and cyclic structures by identity from here on.
-    if depth > _DEPTH or id(value) in visited:
-        return _Same(value)
-    visited.add(id(value))
-    # Compare containers by their items.
-    if isinstance(value, dict):
-        return [(_fingerprint(k, visited, depth + 1), _fingerprint(v, visited, depth + 1)) for k, v in value.items()]
-    if isinstance(value, list | tuple | collections.deque):
-        return [_fingerprint(v, visited, depth + 1) for v in value]
-    if isinstance(value, set | frozenset):
-        return sorted(map(repr, value))
-    # Compare objects of libraries by identity, a program's own objects by their attributes.
-    if type(value).__module__.partition(".")[0] in _LIBRARIES or isinstance(value, type) or callable(value):
-        return _Same(value)
-    return [
-        _Same(value),
-        *((k, _fingerprint(v, visited, depth + 1)) for k, v in getattr(value, "__dict__", {}).items()),
-    ]
+def _fingerprint(value: object) -> bytes | int:
+    """Return a fingerprint of a value that changes with its contents; its identity where they cannot be read."""
+    file = io.BytesIO()
+    try:
+        _Fingerprint(file, protocol=pickle.HIGHEST_PROTOCOL).dump(value)
+    except Exception:  # what a lock or an open file holds is no matter of the simulation
+        return id(value)
+    return file.getvalue()
 
 
 def _has_tracer(value: object) -> bool:
@@ -209,12 +194,7 @@ def _has_tracer(value: object) -> bool:
 
 
 def _drawn() -> object:
-    return _numbers(np.random.get_state()), random.getstate()
-
-
-def _numbers(state: PyTree) -> tuple[bytes, int, list[PyTree]]:
-    _, keys, position, *rest = state
-    return keys.tobytes(), position, rest
+    return _fingerprint((np.random.get_state(), random.getstate()))
 
 
 def check_variables(before: dict[str, PyTree], after: dict[str, PyTree]) -> None:

@@ -89,7 +89,9 @@ class BraxEnv(Env):
         return _brax_state(copy, reward, info, state.metrics)
 
 
-def _brax_state(copy: PyTree, reward: jax.Array, info: dict[str, jax.Array], metrics: dict[str, jax.Array]) -> BraxState:
+def _brax_state(
+    copy: PyTree, reward: jax.Array, info: dict[str, jax.Array], metrics: dict[str, jax.Array]
+) -> BraxState:
     """Return the state of a copy of a task, which has a discount, or of a robot, which has values of its episode."""
     dtype = reward.dtype
     done = copy.done & ~copy.truncated if _STEPS in info else copy.done

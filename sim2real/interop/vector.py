@@ -185,7 +185,7 @@ def _shown(state: PyTree) -> tuple[PyTree, ...]:
 def _box(spec: PyTree, dtype: npt.DTypeLike) -> gymnasium.spaces.Box:
     """Return the space of arrays of a spec; a type without bounds has those of its dtype."""
     dtype = np.dtype(dtype)
-    if dtype == bool:
+    if dtype.kind == "b":
         return gymnasium.spaces.Box(0, 1, spec.shape, np.int8)
     is_float = np.issubdtype(dtype, np.floating)
     widest = (-np.inf, np.inf) if is_float else (np.iinfo(dtype).min, np.iinfo(dtype).max)

@@ -267,13 +267,6 @@ def test_props_are_placed_apart_in_every_copy():
     assert places[..., 2].min() > 0.1
 
 
-def test_props_cannot_settle_in_a_compiled_program():
-    task = Placed(0.4)
-    task.placer = composer.PropPlacer(task.props, [0, 0, 1], settle_physics=True)
-    with pytest.raises(UsageError, match="cannot settle physics on MJX"):
-        composer.MjxEnvironment(task)
-
-
 @pytest.mark.night
 def test_giving_up_is_a_flag():
     class Never(Bounce):

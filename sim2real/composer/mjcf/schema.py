@@ -166,7 +166,7 @@ FLOATS = _words(
     "accel actuatorlength actuatortendon actuatorwidth adhesion alpha area armature azimuth boundinertia boundmass "
     "bulbradius ccd_tolerance coef contactheight contactwidth cranklength cutoff dampratio delay density diameter "
     "divisor emission exponent extent fitscale fogend fogstart force forcewidth fovy fpmax framelength framewidth "
-    "frictionloss fvmax gain gap glow gravcomp impratio inertiabox inflate inheritrange intensity inttotal ipd "
+    "frictionloss fvmax gain gap glow gravcomp haze impratio inertiabox inflate inheritrange intensity inttotal ipd "
     "jointlength jointwidth kp kv linewidth lmax lmin ls_tolerance margin mass maxforce meaninertia meanmass "
     "meansize metallic noise noslip_tolerance o_margin poisson prm radius random realtime ref reflectance roughness "
     "settotalmass shadowclip shadowscale shininess sleep_tolerance softness solmix springref stiffnessrot tausmooth "

@@ -22,7 +22,7 @@ from sim2real.types import PyTree
 
 if TYPE_CHECKING:
     from sim2real.composer.mjcf.element import Elements
-    from sim2real.composer.types import ArrayLike, Index, MjModel
+    from sim2real.composer.types import ArrayLike, MjModel
 
 _FLUID = ("opt.density", "opt.viscosity", "opt.wind")
 _SWITCHES = {**dict.fromkeys(_FLUID, "opt._impl.has_fluid_params"), "body_gravcomp": "flg_gravcomp"}
@@ -291,33 +291,14 @@ def _get(holder: PyTree, path: str) -> PyTree:
     return holder
 
 
+SET_BEFORE = "set it in initialize_episode_mjcf or after_compile, which run before that, or use the C engine"
+
+
 def constant(name: str) -> UsageError:
     """Return the error that a field cannot be set."""
     return UsageError(
-        f"MJX cannot change {name!r} inside a compiled program: it is one of its constants",
-        hint="set it in initialize_episode_mjcf or after_compile, which run before that, or use the C engine",
+        f"MJX cannot change {name!r} inside a compiled program: it is one of its constants", hint=SET_BEFORE
     )
-
-
-class ConstantView(np.ndarray):
-    """An array that is the same in all copies: writing into it is refused, by name."""
-
-    name: str = ""
-
-    def __array_finalize__(self, obj: np.ndarray | None) -> None:
-        """Let arrays that are computed from this one be plain."""
-        self.name = ""
-
-    def __getitem__(self, key: Index) -> PyTree:
-        part = super().__getitem__(key)
-        if isinstance(part, ConstantView):
-            part.name = self.name
-        return part
-
-    def __setitem__(self, key: Index, value: object) -> None:
-        if self.name:
-            raise constant(self.name)
-        super().__setitem__(key, value)
 
 
 class Struct:
@@ -337,11 +318,15 @@ class Struct:
 def shown(value: PyTree, name: str) -> PyTree:
     """Return a value of the compiled model as hooks may see it."""
     if isinstance(value, np.ndarray):
-        view = value.view(ConstantView)
-        view.flags.writeable = False
-        view.name = name
-        return view
+        return read_only(value.view())
     return Struct(value, name) if type(value).__module__.startswith("mujoco") and not callable(value) else value
+
+
+def read_only(array: PyTree) -> PyTree:
+    """Return an array of numpy's, which is the same in all copies, after switching writes into it off."""
+    if isinstance(array, np.ndarray):
+        array.flags.writeable = False
+    return array
 
 
 class OptionView:
@@ -404,7 +389,7 @@ class MjxBinding(BaseBinding):
 
     def read(self, name: str) -> PyTree:
         field, index = self.locate(name)
-        return self._physics.read(field)[index]
+        return read_only(self._physics.read(field)[index])
 
     def write(self, name: str, value: ArrayLike) -> None:
         field, index = self.locate(name)
@@ -418,6 +403,4 @@ class MjxBinding(BaseBinding):
 def freeze(model: MjModel) -> None:
     """Make the arrays of a compiled ``MjModel`` read-only: programs no longer look at them."""
     for name in layout.array_fields("model"):
-        array = getattr(model, name)
-        if isinstance(array, np.ndarray):
-            array.flags.writeable = False
+        read_only(getattr(model, name))
