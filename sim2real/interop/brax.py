@@ -56,16 +56,33 @@ class BraxEnv(Env):
         self.environment: PyTree = environment
         observation, action = specs_of(environment)
         shapes = observation.values() if isinstance(observation, Mapping) else [observation]
-        self.observation_size = sum(math.prod(spec.shape) for spec in shapes)
-        self.action_size = math.prod(action.shape)
+        self._sizes = sum(math.prod(spec.shape) for spec in shapes), math.prod(action.shape)
         self.max_episode_length = environment.step_limit
-        self.backend = "mjx"  # in brax's terms: an engine other than brax's
         self._middle: PyTree = None
         if isinstance(environment, RobotEnvironment):
-            self.dt = 1.0 / environment.rate_hz
-            self._middle, self._half = (action.maximum + action.minimum) / 2, (action.maximum - action.minimum) / 2
-        else:
-            self.dt = environment.task.control_timestep
+            low, high = action.minimum, action.maximum  # pyright: ignore[reportAttributeAccessIssue] - it has bounds
+            self._middle, self._half = (high + low) / 2, (high - low) / 2
+
+    @property
+    def observation_size(self) -> int:
+        """Length of an observation."""
+        return self._sizes[0]
+
+    @property
+    def action_size(self) -> int:
+        """Length of an action."""
+        return self._sizes[1]
+
+    @property
+    def backend(self) -> str:
+        """The engine, in brax's terms: ``mjx`` means an engine other than brax's."""
+        return "mjx"
+
+    @property
+    def dt(self) -> float:
+        """Time between two actions [s]."""
+        is_robot = isinstance(self.environment, RobotEnvironment)
+        return 1.0 / self.environment.rate_hz if is_robot else self.environment.task.control_timestep
 
     def reset(self, rng: Key) -> BraxState:
         """Return a copy at the start of an episode."""

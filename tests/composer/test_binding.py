@@ -4,7 +4,7 @@ import pickle
 import mujoco
 import numpy as np
 import pytest
-from composer_parts import ARM, scene
+from composer_parts import ARM
 
 from sim2real.composer import mjcf
 from sim2real.errors import UsageError
@@ -14,19 +14,6 @@ from sim2real.errors import UsageError
 def arm():
     model = mjcf.from_xml_string(ARM)
     return model, mjcf.Physics.from_mjcf_model(model)
-
-
-def test_what_follows_from_a_write_is_computed_before_it_is_read(arm):
-    model, physics = arm
-    joint, wrist = model.find("joint", "shoulder"), model.find("site", "wrist")
-    before = physics.bind(wrist).xpos.copy()
-    physics.bind(joint).qpos = 0.4
-    assert physics.is_dirty
-    assert not np.allclose(physics.bind(wrist).xpos, before)
-    assert not physics.is_dirty
-    physics.bind(joint).qpos[0] += 0.1
-    assert physics.data.qpos[0] == 0.5
-    assert physics.is_dirty
 
 
 def test_parts_of_several_elements_are_written_through(arm):
@@ -46,22 +33,6 @@ def test_parts_of_several_elements_are_written_through(arm):
     sums[0] = 9
     assert physics.data.qpos[0] == 0
     assert not geoms.element_id.flags.writeable
-
-
-def test_writing_a_pose_switches_mujocos_shortcuts_off(arm):
-    model, physics = arm
-    geom = model.worldbody.geom[0]
-    assert physics.bind(geom).sameframe != 0
-    physics.bind(geom).pos = [0.2, 0, 0]
-    assert physics.bind(geom).sameframe == 0
-    np.testing.assert_array_equal(physics.bind(geom).xpos, [0.2, 0, 0])
-
-
-def test_nothing_bound_is_empty(arm):
-    _, physics = arm
-    assert physics.bind([]).qpos.shape == (0,)
-    with pytest.raises(UsageError, match="empty binding"):
-        physics.bind([]).qpos = 1
 
 
 def test_what_cannot_be_bound_is_named(arm):
@@ -162,35 +133,3 @@ def test_constants_are_computed_anew_without_moving_the_state():
     physics.forward()
     physics.recompute_constants()
     assert physics.data.xpos[1, 2] == 0.5  # what the next step starts from
-
-
-BOUND = [
-    ("joint", "arm/shoulder", "qpos qvel damping range type qpos0 xaxis cdof qposadr limited qfrc_bias"),
-    ("joint", "prop/", "qpos qvel damping"),
-    ("body", "arm/upper", "xpos xmat mass pos inertia xfrc_applied subtreemass weldid"),
-    ("geom", "prop/ball", "xpos xmat size rgba type friction bodyid pos"),
-    ("site", "arm/wrist", "xpos xmat size pos quat"),
-    ("actuator", "arm/shoulder", "ctrl ctrlrange force gear act velocity length"),
-    ("actuator", "arm/hand/bend", "ctrl act gainprm"),
-    ("sensor", "arm/hand/tip", "sensordata adr dim type cutoff"),
-    ("camera", "front", "xpos fovy pos"),
-    ("equality", "arm//unnamed_equality_0", "active data type"),
-]
-
-
-@pytest.mark.parametrize("several", [False, True], ids=["one", "list"])
-@pytest.mark.parametrize(("kind", "name", "attributes"), BOUND, ids=[f"{b[0]}-{b[1]}" for b in BOUND])
-def test_bound_attributes_have_the_same_shape_and_value(oracle, ours, kind, name, attributes, several):
-    values = []
-    for kit in (oracle, ours):
-        root = scene(kit)[0].mjcf_model
-        physics = kit.mjcf.Physics.from_mjcf_model(root)
-        element = next(e for e in root.find_all(kind) if e.full_identifier == name)
-        binding = physics.bind([element] if several else element)
-        values.append(
-            {a: np.array(getattr(binding, a)) for a in attributes.split()} | {"id": np.array(binding.element_id)}
-        )
-    for attribute, value in values[0].items():
-        assert values[1][attribute].shape == value.shape, attribute
-        assert values[1][attribute].dtype == value.dtype, attribute
-        np.testing.assert_array_equal(values[1][attribute], value)

@@ -51,26 +51,6 @@ def test_an_entity_that_is_not_attached_has_no_pose():
         ball.get_pose(physics)
 
 
-def test_the_tree_is_walked_depth_first_and_survives_detaching():
-    e = [Ball(f"e{i}") for i in range(4)]
-    e[0].attach(e[1])
-    e[1].attach(e[2])
-    e[0].attach(e[3])
-    assert list(e[0].iter_entities()) == e
-    assert list(e[0].iter_entities(exclude_self=True)) == e[1:]
-    assert e[2].root_body == mjcf.get_attachment_frame(e[2].mjcf_model)
-    e[1].detach()
-    assert (e[1].parent, e[2].parent) == (None, e[1])
-    assert list(e[0].iter_entities()) == [e[0], e[3]]
-    assert mjcf.Physics.from_mjcf_model(e[0].mjcf_model).model.ngeom == 2
-    assert mjcf.Physics.from_mjcf_model(e[1].mjcf_model).model.ngeom == 2
-    with pytest.raises(RuntimeError, match="Cannot detach an entity that is not attached"):
-        e[1].detach()
-    e[3].attach(e[1])
-    physics = mjcf.Physics.from_mjcf_model(e[0].mjcf_model)
-    assert physics.model.name2id("e3/e1/e2/", "body") > 0
-
-
 def test_configure_joints_sets_own_joints_and_those_of_childrens_frames():
     arena, ball, door = composer.Arena(), Ball(), Ball("door")
     frame = ball.attach(door)

@@ -103,16 +103,6 @@ def test_other_errors_are_not_retried():
         env.reset()
 
 
-def test_models_are_compiled_anew_at_every_reset_or_only_at_the_first():
-    for every, expected in ((True, 4), (False, 2)):
-        task, compiled = Swing(), []
-        task.after_compile = lambda physics, random_state, compiled=compiled: compiled.append(physics)
-        env = composer.Environment(task, recompile_mjcf_every_episode=every)
-        for _ in range(3):
-            env.reset()
-        assert len(compiled) == expected
-
-
 def test_the_physics_is_a_weak_reference_that_dies_with_its_model():
     env = composer.Environment(Swing())
     before = env.physics

@@ -29,17 +29,6 @@ class Part(composer.Entity):
         return self._model
 
 
-def test_enabling_and_adding():
-    part = Part()
-    part.observables.enable_all()
-    assert all(o.enabled for o in part.observables.as_dict().values())
-    part.observables.disable_all()
-    part.observables.add_observable("third", Generic(lambda physics: 3.0))
-    part.observables.add_observable("fourth", lambda physics: 4.0, enabled=False)
-    assert [n for n, o in part.observables.as_dict().items() if o.enabled] == ["third"]
-    assert part.observables.get_observation(None) == {"first": 1.0, "second": 2.0, "third": 3.0, "fourth": 4.0}
-
-
 def test_features_are_indexed_once_and_want_elements():
     model = mjcf.from_xml_string("<mujoco><worldbody><geom name='g' size='.1' pos='1 2 3'/></worldbody></mujoco>")
     geom = model.find("geom", "g")

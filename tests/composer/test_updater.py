@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from sim2real.composer.observation.observable import Generic
 from sim2real.composer.observation.updater import Updater
-from sim2real.composer.variation import deterministic, noises
+from sim2real.composer.variation import deterministic
 from sim2real.errors import UsageError
 
 
@@ -70,44 +70,6 @@ def test_the_schedule_is_the_nominal_one(intervals, delays, size, steps):
     assert [f["value"].tolist() for f in found] == nominal(intervals, delays, size, steps, 6)
 
 
-def test_late_samples_are_ordered_by_arrival():
-    value = Generic(
-        lambda clock: clock.steps,
-        buffer_size=3,
-        update_interval=deterministic.Sequence([3, 2, 3, 3, 4, 1, 4]),
-        delay=deterministic.Sequence([3, 5, 2, 5, 1, 2, 4]),
-    )
-    found = [f["value"].tolist() for f in observe({"value": value}, 10, 4)]
-    assert found == [[0, 0, 0], [0, 5, 3], [8, 15, 16], [20, 25, 23], [28, 35, 36]]
-
-
-def test_padding_and_shapes():
-    late = Generic(lambda clock: 7.0 + clock.steps, delay=4, buffer_size=2)
-    assert [f["late"].tolist() for f in observe({"late": late}, 2, 3)] == [[0, 0], [0, 0], [0, 7], [8, 9]]
-    initial = observe({"late": late}, 2, 3, pad_with_initial_value=True)
-    assert [f["late"].tolist() for f in initial] == [[7, 7], [7, 7], [7, 7], [8, 9]]
-    single = Generic(lambda clock: 7.0, delay=1)
-    assert observe({"x": single}, 1, 0, strip_singleton_buffer_dim=True, pad_with_initial_value=True)[0]["x"] == 7.0
-    assert observe({"x": single}, 1, 0)[0]["x"].tolist() == [0.0]
-    vector = Generic(lambda clock: [1, 2], buffer_size=3)
-    assert observe({"x": vector}, 1, 0)[0]["x"].tolist() == [[0, 0], [0, 0], [1, 2]]
-
-
-@pytest.mark.parametrize(("name", "expected"), [("min", 4), ("max", 6), ("mean", 5), ("median", 5), ("sum", 15)])
-def test_aggregators_reduce_the_buffer(name, expected):
-    value = Generic(lambda clock: clock.steps, buffer_size=3, aggregator=name)
-    assert observe({"x": value}, 3, 2)[-1]["x"] == expected
-
-
-def test_corruptors_see_the_samples_that_are_observed():
-    seen = []
-    noisy = Generic(lambda clock: clock.steps, corruptor=lambda v, random_state: seen.append(v) or v + 0.5)
-    assert observe({"x": noisy}, 3, 1)[-1]["x"].tolist() == [3.5]
-    assert seen == [0, 3]
-    exact = Generic(lambda clock: 2.0, corruptor=noises.Additive(deterministic.Constant(0.25)))
-    assert observe({"x": exact}, 1, 1)[-1]["x"].tolist() == [2.25]
-
-
 def test_samples_that_nobody_can_read_are_not_taken():
     seen = []
     value = Generic(lambda clock: seen.append(clock.steps) or clock.steps)
@@ -131,18 +93,6 @@ def test_specs_keep_bounds_that_the_aggregator_keeps():
     assert spec("mean") == specs.BoundedArray((2,), float, 1, 4, "x")
     with pytest.warns(UserWarning, match="bounds of observable 'x' are dropped"):
         assert spec("sum") == specs.Array((2,), float, "x")
-
-
-def test_structures_are_kept_and_wrong_ones_refused():
-    a, b = Generic(lambda clock: 1.0), Generic(lambda clock: 2.0)
-    a.enabled = True
-    updater = Updater(({"a": a}, {"b": b}))
-    with pytest.raises(RuntimeError, match="reset"):
-        updater.get_observation()
-    updater.reset(Clock(), None)
-    assert updater.get_observation() == ({"a": np.ones(1)}, {})
-    with pytest.raises(ValueError, match="should be a dict"):
-        Updater([a])
 
 
 def test_impossible_schedules_are_refused():

@@ -33,6 +33,8 @@ IMPORTS = {
     ),
     "from dm_control.composer.variation import deterministic": "from sim2real.composer.variation import deterministic",
     "from dm_control.composer.variation import noises": "from sim2real.composer.variation import noises",
+    "from dm_control.composer import variation": "from sim2real.composer import variation",
+    "from dm_control.composer.variation import base": "from sim2real.composer.variation import base",
 }
 FAILS = {
     "mjcf.element_test": {"testActuatorReordering": "tree_surgery", "testProperties": "tree_surgery"},
@@ -41,7 +43,8 @@ FAILS = {
         "test_bind_mocap_body": "", "test_error_when_pickling_synchronizing_array_wrapper": "", "test_exceptions": "",
     },
     "composer.entity_test": {}, "composer.environment_test": {}, "composer.observation.updater_test": {},
-    "composer.variation.noises_test": {},
+    "composer.variation.noises_test": {}, "composer.variation.variation_test": {},
+    "mjcf.export_with_assets_as_zip_test": {},
 }  # fmt: skip
 """Module -> test that fails -> the row that says why; none where more works here, or a private name is looked for."""
 
@@ -52,7 +55,8 @@ def with_our_imports(name, folder):
     text = Path(spec.origin).read_text()
     for theirs, ours in IMPORTS.items():
         text = re.sub(rf"^{re.escape(theirs)}$", ours, text, flags=re.MULTILINE)
-    (folder / "test_assets").symlink_to(Path(spec.origin).with_name("test_assets"))  # which it looks for beside itself
+    if (assets := Path(spec.origin).with_name("test_assets")).exists():
+        (folder / "test_assets").symlink_to(assets)  # which it looks for beside itself
     path = folder / f"{name.replace('.', '_')}_with_ours.py"
     path.write_text(text)
     made = importlib.util.spec_from_file_location(path.stem, path)
@@ -76,6 +80,6 @@ def test_every_failure_is_on_the_page(name, tmp_path, monkeypatch):
         suite.run(result)
     failed = {re.match(r"\w+", test.id().rsplit(".", 1)[1])[0] for test, _ in result.failures + result.errors}
     assert failed == FAILS[name].keys()
-    assert result.testsRun >= 6
+    assert result.testsRun >= 3
     for row in filter(None, FAILS[name].values()):
         assert f"| {row} |" in PAGE.read_text()

@@ -1,6 +1,8 @@
 """A robot as an environment of Stable-Baselines3."""
 
+import importlib.util
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,10 +26,23 @@ def test_copies_that_start_anew_later_are_refused(pendulum):
         to_baselines(vector_env(pendulum, 2))
 
 
+class VecEnv:
+    """In the place of Stable-Baselines3's, where that is not installed: it brings PyTorch."""
+
+    def __init__(self, num_envs, observation_space, action_space):
+        self.num_envs, self.observation_space, self.action_space = num_envs, observation_space, action_space
+
+    def step(self, actions):
+        self.step_async(actions)
+        return self.step_wait()
+
+
 @pytest.fixture(scope="module")
 def env(pendulum):
-    pytest.importorskip("stable_baselines3", reason="pip install stable-baselines3 (installs PyTorch)")
-    return baselines_env(pendulum, 4, seed=3)
+    with pytest.MonkeyPatch.context() as patch:
+        if importlib.util.find_spec("stable_baselines3") is None:
+            patch.setitem(sys.modules, "stable_baselines3.common.vec_env", SimpleNamespace(VecEnv=VecEnv))
+        yield baselines_env(pendulum, 4, seed=3)
 
 
 def test_the_time_limit_is_told_with_the_last_observation(env):
@@ -43,6 +58,10 @@ def test_the_time_limit_is_told_with_the_last_observation(env):
     assert infos[0]["terminal_observation"][15] == 1.0
     env.seed(3)
     np.testing.assert_array_equal(env.reset(), first)
+    assert env.get_attr("num_envs", [0, 2]) == [4, 4]
+    assert env.env_method("close", indices=1) == [None]
+    with pytest.raises(UsageError, match="cannot be set"):
+        env.set_attr("num_envs", 3)
 
 
 def test_its_ppo_trains_on_it(env):
