@@ -23,7 +23,6 @@ MAY_IMPORT = {
     "hardware": {"sim2real.policy.runner"},
     "interop": {"sim2real.interop.brax", "sim2real.interop.vector"},
     "parquet": {"sim2real.log.importing.lerobot"},
-    "tensorboard": {"sim2real.stages.train.tensorboard"},
     "unitree": {"sim2real.emulation.legs", "sim2real.hardware.unitree.dds", "sim2real.hardware.unitree.messages"},
     "warp": set(),  # MJX imports Warp itself
 }

@@ -24,7 +24,7 @@ from sim2real.commands.stages import module_of
 from sim2real.errors import DelayChanged, Sim2RealError, UsageError
 from sim2real.robots.robot import RecordedRobot, Robot
 from sim2real.stages.config import DeployConfig, IdentifyConfig, RecordConfig, TrainConfig
-from sim2real.stages.deploy.next_command import logs_to_identify, needs_timing, terms_to_identify
+from sim2real.stages.deploy.verdict import logs_to_identify, needs_timing, terms_to_identify
 from sim2real.stages.load import AnyRobot, defaults_of, robot_of, shipped_policy
 from sim2real.stages.shared.arguments import AnyPath, config_of, folder_of
 from sim2real.stages.shared.find_run import find_run

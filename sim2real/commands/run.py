@@ -52,7 +52,7 @@ def _run(name: str, parsed: RunFlags) -> None:
     """Run the stages, print the main figures of each, and end with the verdict and the page."""
     compilation_cache.enable(parsed.cache)
     from sim2real.commands.loop import run_all
-    from sim2real.stages.terminal import brief, console
+    from sim2real.stages.terminal import console
 
     robot = load_robot(name)
 
@@ -60,7 +60,7 @@ def _run(name: str, parsed: RunFlags) -> None:
         if parsed.verbose:
             done = run_stage(stage, robot, config, parsed.runs, run_dir, page=stage == "identify")
         else:
-            with brief.brief():
+            with console.brief():
                 done = run_stage(stage, robot, config, parsed.runs, run_dir, page=stage == "identify")
         if done is None:
             raise UsageError(f"{stage} runs in several processes, and this one writes no folder")

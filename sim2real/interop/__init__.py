@@ -49,9 +49,9 @@ def robot_environment(
     from sim2real.stages.load import available, defaults_of, load_robot, moving
     from sim2real.stages.shared.arguments import open_identification
     from sim2real.stages.shared.find_run import find_run
-    from sim2real.stages.train.inputs import find_parameters
-    from sim2real.stages.train.trained_bundle import contract_of
-    from sim2real.stages.train.training_setup import prepare
+    from sim2real.stages.train.bundle import contract_of
+    from sim2real.stages.train.setup import prepare
+    from sim2real.stages.train.stage import find_parameters
 
     run = None
     if isinstance(source, Robot):

@@ -18,7 +18,7 @@ from sim2real.log.importing.propose import propose
 from sim2real.log.importing.readers import open_tables
 from sim2real.log.importing.signals import ImportHints
 from sim2real.stages.load import load_robot
-from sim2real.stages.train.trained_bundle import has_readings
+from sim2real.stages.train.bundle import has_readings
 
 EPISODES = [motion(120, seed) for seed in range(3)]
 

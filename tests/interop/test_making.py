@@ -40,7 +40,7 @@ def test_a_robot_that_shows_more_than_it_names_is_refused(pendulum):
     from dataclasses import replace
 
     from sim2real.interop.robot import RobotEnvironment
-    from sim2real.stages.train.trained_bundle import contract_of
+    from sim2real.stages.train.bundle import contract_of
 
     env = pendulum.env
     contract = contract_of(sim2real.load_robot("pendulum"), env.task, {})

@@ -12,7 +12,7 @@ from sim2real.graph.schedule import draw
 from sim2real.interop.robot import RobotEnvironment
 from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.stages.load import load_robot
-from sim2real.stages.train.trained_bundle import contract_of
+from sim2real.stages.train.bundle import contract_of
 from sim2real.training.environment.graph_environment import GraphEnvironment
 
 VALUES = {"sensor_delay": 0.02, "actuator_delay": 0.025}

@@ -12,7 +12,7 @@ sys.modules["serial"] = None  # an import of pyserial fails
 from sim2real.stages.config import TrainConfig
 from sim2real.stages.load import load_robot
 from sim2real.stages.train import stage
-from sim2real.stages.train.training_setup import prepare
+from sim2real.stages.train.setup import prepare
 pipeline = load_robot(sys.argv[1])
 prepare(pipeline, TrainConfig(model="nominal", episode_s=0.5, timelines=1), None)
 print(json.dumps([n for n in sys.modules if n.startswith("sim2real.hardware.") and n.endswith((".device", ".drive"))]))

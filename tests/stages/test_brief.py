@@ -6,7 +6,7 @@ import pytest
 
 from sim2real import cli
 from sim2real.stages.terminal import console
-from sim2real.stages.terminal.brief import brief
+from sim2real.stages.terminal.console import brief
 
 
 def test_details_are_held_back_and_warnings_are_not(capsys):

@@ -7,8 +7,8 @@ import pytest
 
 from sim2real.errors import UsageError
 from sim2real.stages.load import load_robot
-from sim2real.stages.train.show import disturbance_rows
-from sim2real.stages.train.training_setup import prepare
+from sim2real.stages.train.bundle import disturbance_rows
+from sim2real.stages.train.setup import prepare
 from sim2real.training.environment.variation import VariationConfig
 
 

@@ -13,7 +13,7 @@ from sim2real.graph.episode import Episode, MemoryRecorder, MessageRecord, StepR
 from sim2real.graph.node import BaseNode
 from sim2real.graph.schedule import draw
 from sim2real.robots.loop import control_nodes
-from sim2real.stages.deploy import simulation_gap, simulations
+from sim2real.stages.deploy import simulation
 from sim2real.stages.load import load_robot
 
 ARM = load_robot("arm")
@@ -37,7 +37,7 @@ def states(tmp_path_factory):
     episode = Episode(
         steps={n: steps(len(next(iter(o.values())))) for n, o in outputs.items()}, messages={}, outputs=outputs
     )
-    return outputs, *simulation_gap._states(
+    return outputs, *simulation._recorded(
         Recording(tmp_path_factory.mktemp("deploy") / "session.mcap", episode), ARM, True
     )
 
@@ -66,12 +66,12 @@ def test_the_gap_report_tells_how_old_the_data_were_that_the_policy_acted_on():
         recorder.message(MessageRecord("agent", "sensor", k, k, 20_000 * k, 20_000 * k))
         recorder.message(MessageRecord("actuator", "agent", k, k, begin + 1000, begin + 1000))
     nodes = control_nodes(*(BaseNode(name, 50.0, delay=0.002) for name in ("sensor", "agent", "actuator")))
-    rows = {row.quantity: row for row in simulation_gap._age_rows([recorder.episode()], draw(nodes, 1.0, 3))}
+    rows = {row.quantity: row for row in simulation.age_rows([recorder.episode()], draw(nodes, 1.0, 3))}
     worst = rows["age_of_sensor_in_agent_max_s"]
     assert [worst.real, worst.simulation, worst.gap] == pytest.approx([0.08, 0.002, 0.078])
     assert rows["age_of_sensor_in_agent_p50_s"].real == pytest.approx(0.0)
     assert len(rows) == 4
-    alone = simulation_gap._age_rows([recorder.episode()], None)
+    alone = simulation.age_rows([recorder.episode()], None)
     assert [row.simulation for row in alone] == [None] * 4
 
 
@@ -80,7 +80,7 @@ def test_a_deployment_on_a_machine_that_was_too_busy_is_reported_without_a_simul
     busy = Steps(**{**vars(slow), "end": slow.start + 100_000})
     episode = Episode(steps={"agent": busy}, messages={}, outputs={})
     rest = [np.zeros(1)]
-    assert simulations.simulate(ARM, None, [{"gain": 1.0}], Timing.of(episode), 1.0, rest, "world") == (None, None)
+    assert simulation.simulate(ARM, None, [{"gain": 1.0}], Timing.of(episode), 1.0, rest, "world") == ([], None)
     assert (
         "warning: nothing to compare with: only 0 of 50 steps of node 'agent' took less than" in capsys.readouterr().err
     )
@@ -104,7 +104,7 @@ def test_simulated_measurements_are_compared_with_measurements():
     policy = Push(jnp.full(1, 1.5))
     # The robot rested beside the start of its task, a turn away.
     rest, timing = [np.array([3 * np.pi + 0.06])], Timing.of(episode)
-    (t_s, world), (at_s, sensor) = simulations.simulate(robot, policy, [values], timing, 0.6, rest, "world")[0][0]
+    (t_s, world), (at_s, sensor) = simulation.simulate(robot, policy, [values], timing, 0.6, rest, "world")[0][0]
     assert float(sensor["th"][0]) == pytest.approx(np.pi + 0.06, abs=1e-4)
     assert set(sensor) == set(world) == {"th", "thdot", "command", "t_command"}
     assert len(sensor["th"]) == len(at_s) < len(t_s)

@@ -12,7 +12,7 @@ from sim2real.artifacts.recording import Recording
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode, Steps
 from sim2real.stages.deploy import replay, verdict
-from sim2real.stages.deploy.next_command import with_command
+from sim2real.stages.deploy.verdict import with_command
 from sim2real.stages.load import load_robot
 
 FRICTION = Changed("friction", "rad/s^2", 6.0, 12.0, 11.0, 13.0, 0.9, 1e-20)

@@ -12,8 +12,8 @@ from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.run import open_stage
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.stages.load import defaults_of
-from sim2real.stages.train import resume, stage
-from sim2real.stages.train.resume import CHECKPOINT, find_interrupted
+from sim2real.stages.train import stage
+from sim2real.stages.train.stage import CHECKPOINT, find_interrupted
 
 TINY = [
     *("train", "pendulum", "--model", "nominal", "--episode-s", "0.5", "--timelines", "2", "--seed", "1"),
@@ -77,19 +77,19 @@ def settings(own, target, **changes):
 def test_what_cannot_be_resumed_is_refused(runs, tmp_path):
     own, whole = folder(runs), folder(runs / "whole")
     with pytest.raises(UsageError, match="is a training of pendulum, not of arm"):
-        resume.find_interrupted("arm", settings(own, own), runs)
+        stage.find_interrupted("arm", settings(own, own), runs)
     with pytest.raises(UsageError, match="there is no interrupted training of 'pendulum'"):
-        resume.find_interrupted("pendulum", settings(own, whole), runs)
+        stage.find_interrupted("pendulum", settings(own, whole), runs)
     early = tmp_path / "train"
     early.mkdir()
     shutil.copy(own / "manifest.json", early)
     with pytest.raises(Sim2RealError, match="interrupted before its first evaluation"):
-        resume.find_interrupted("pendulum", settings(own, early), runs)
+        stage.find_interrupted("pendulum", settings(own, early), runs)
     other = tmp_path / "parameters.json"
     other.write_text("{}")
-    found = resume.find_interrupted("pendulum", settings(own, own), runs)
+    found = stage.find_interrupted("pendulum", settings(own, own), runs)
     with pytest.raises(UsageError, match="trains on other parameters than"):
-        resume.check_same_parameters(found, other)
+        stage.check_same_parameters(found, other)
 
 
 def test_what_cannot_be_swept_is_refused_at_once(capsys):

@@ -15,7 +15,7 @@ from sim2real.graph.schedule import draw
 from sim2real.robots.loop import AGENT
 from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.stages.load import load_robot
-from sim2real.stages.train.show import training_summary
+from sim2real.stages.train.bundle import training_summary
 from sim2real.training.config import PPOConfig
 from sim2real.training.environment.graph_environment import GraphEnvironment
 from sim2real.training.environment.protocol import Step

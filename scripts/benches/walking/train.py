@@ -115,7 +115,7 @@ def first_step() -> float:
     import jax.numpy as jnp
 
     from sim2real.stages.load import load_robot
-    from sim2real.stages.train.training_setup import prepare
+    from sim2real.stages.train.setup import prepare
 
     pipeline = load_robot(PIPELINE)
     env, keys = prepare(pipeline, pipeline.defaults.train).env, jax.random.split(jax.random.key(0), 8)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,8 +16,8 @@ from sim2real.artifacts.run import StageFolder, finished, newest, open_stage, sh
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.hardware.safety.following import Following
 from sim2real.installation import has_jax
-from sim2real.policy.contract import ActionTerm, ObservationTerm
-from sim2real.robots.robot import RecordedRobot, Robot, in_world
+from sim2real.policy.contract import PolicyContract
+from sim2real.robots.robot import RecordedRobot, Robot, RobotAgent, in_world
 from sim2real.stages.deploy.config import DeployConfig
 from sim2real.stages.deploy.episodes import run_episodes
 from sim2real.stages.load import AnyRobot, defaults_of, moving, robot_of, shipped_policy
@@ -87,7 +87,7 @@ def _deployed(
         return Deployment(scores, (), units, simulated, tuple(recordings), dry_run=True, summary=sessions)
 
     # Simulate the same. JAX programs are imported and compiled only now, when the robot is at rest.
-    from sim2real.stages.deploy.simulation_gap import compare
+    from sim2real.stages.deploy.simulation import compare
     from sim2real.stages.deploy.verdict import judge
 
     world = None if identification is None else identification.world
@@ -116,7 +116,8 @@ def run(robot: RecordedRobot, config: DeployConfig, root: Path, run_dir: Path | 
             stage.output(f"log_{i}", log_of(stage.folder, i).name)
         if config.port == "embedded":
             stage.output("truth", TRUTH)
-        identification = _identification(robot, stage.run_dir)
+        identified = finished(stage.run_dir, "identify")
+        identification = None if identified is None else open_identification(identified.output("parameters"), robot)
         deployment = _deployed(robot, bundle, stage.folder, config, identification)
         summaries = deployment.summary
         show_sessions(summaries, config.dry_run, config.port == "embedded")
@@ -132,7 +133,7 @@ def run(robot: RecordedRobot, config: DeployConfig, root: Path, run_dir: Path | 
             for name, file in recording.timing.save(stage.folder, f"timing_{i}").items():
                 stage.output(name, file)
         _show(deployment)
-        stage.summary(_summary_lines(deployment, summaries))
+        stage.summary(_summary_lines(deployment, summaries[-1]))
         for summary in summaries if config.strict_timing else ():
             check_deadlines(summary)
     return stage.result
@@ -158,41 +159,29 @@ def _following(robot: Robot, identification: Identification) -> Following | None
     return replace(following, delay_s=delays[0]) if delays else None
 
 
-def _identification(robot: RecordedRobot, run_dir: Path) -> Identification | None:
-    """Return the run's newest identification; None if the run has none."""
-    folder = finished(run_dir, "identify")
-    return None if folder is None else open_identification(folder.output("parameters"), robot)
-
-
 def _show(deployment: Deployment) -> None:
     """Print the gap to simulation, the tests of the model and the verdict of a deployment."""
-    if deployment.gap:
-        print(artifact_table(deployment.rows()))
-    if deployment.trained:
-        print(artifact_table(deployment.times_table()))
-    if deployment.replay:
-        print(artifact_table(deployment.replay_table()))
-    if deployment.drift is not None:
-        print(artifact_table(deployment.drift.rows()))
-    if deployment.advice is not None:
-        note(f"verdict: {deployment.advice.status}")
-        for reason in deployment.advice.reasons:
-            note(f"  {reason}")
-        if deployment.advice.next:
-            note(f"next: {deployment.advice.next}")
+    tables = [deployment.rows(), deployment.times_table(), deployment.replay_table()]
+    tables += [] if deployment.drift is None else [deployment.drift.rows()]
+    for content in tables:
+        if content.rows:
+            print(artifact_table(content))
+    if (advice := deployment.advice) is not None:
+        note("\n  ".join([f"verdict: {advice.status}", *advice.reasons]))
+        if advice.next:
+            note(f"next: {advice.next}")
 
 
-def _summary_lines(deployment: Deployment, summaries: Sequence[Mapping[str, Json]]) -> dict[str, Json]:
-    """Return the lines that the console prints at the end."""
+def _summary_lines(deployment: Deployment, last: Mapping[str, Json]) -> dict[str, Json]:
+    """Return the lines that the console prints at the end.
+
+    Args:
+        last: Summary of the last session.
+    """
     scores = {f"success, deployment {i}": e.real.get("success") for i, e in enumerate(deployment.episodes)}
-    last = summaries[-1]
-    return {
-        **{name: round(value, 3) for name, value in scores.items() if value is not None},
-        **{name: value for name, value in last.items() if name == "measured delay"},
-        "lost replies": last["lost_replies"],
-        "late replies": last["late_replies"],
-        "command timeouts": last["command_timeouts"],
-    }
+    counts = {name: last[name.replace(" ", "_")] for name in ("lost replies", "late replies", "command timeouts")}
+    measured = {name: value for name, value in last.items() if name == "measured delay"}
+    return {**{name: round(v, 3) for name, v in scores.items() if v is not None}, **measured, **counts}
 
 
 def find_bundle(
@@ -236,56 +225,49 @@ def require_fit(robot: Robot, bundle: Bundle, config: DeployConfig) -> None:
     Raises:
         Sim2RealError: Names the difference.
     """
-    _require_robot(robot, bundle, config)
-    if config.max_tilt_rad is not None and robot.agent.tilt_rad is None:
-        raise UsageError("this robot does not measure its tilt", hint="run without --max-tilt-rad, or set tilt_rad")
-    contract, where = bundle.contract, f"in {bundle.path}" if bundle.path else "that was trained"
-    for verb, in_bundle, of_robot in (
-        ("sees", _observations(contract.observation), _observations(robot.agent.observation)),
-        ("sends", _actions(contract.action), _actions(robot.agent.action)),
-    ):
-        if in_bundle != of_robot:
-            raise Sim2RealError(f"the policy {where} {verb} {in_bundle}, this robot has {of_robot}", hint=_TRAIN)
-    if contract.rate_hz != robot.rate_hz:
+    contract, agent = bundle.contract, robot.agent
+    where = f"in {bundle.path}" if bundle.path else "that was trained"
+    if contract.robot and robot.folder is not None and contract.robot != robot.name:
         raise Sim2RealError(
-            f"the policy {where} runs at {contract.rate_hz:g} Hz, this robot at {robot.rate_hz:g} Hz", hint=_TRAIN
+            f"the policy {where} was trained for {contract.robot!r}, this is {robot.name!r}", hint=_TRAIN
         )
-    for trained, term in zip(contract.observation, robot.agent.observation, strict=True):
+    if contract.port and (contract.port == _EMBEDDED) != (config.port == _EMBEDDED):
+        _refuse_port(contract.port, config, where)
+    if config.max_tilt_rad is not None and agent.tilt_rad is None:
+        raise UsageError("this robot does not measure its tilt", hint="run without --max-tilt-rad, or set tilt_rad")
+
+    def terms(of: PolicyContract | RobotAgent) -> dict[str, object]:
+        seen = [(t.name, tuple(t.units), t.history) for t in of.observation]
+        return {"sees": seen, "sends": [(t.name, t.unit) for t in of.action]}
+
+    # A row for each difference: what the policy has, and what the robot has.
+    rows: list[tuple[str, str]] = []
+    for (verb, trained), here in zip(terms(contract).items(), terms(agent).values(), strict=True):
+        rows += [(f"{verb} {trained}", f"has {here}")] if trained != here else []
+    if contract.rate_hz != robot.rate_hz:
+        rows.append((f"runs at {contract.rate_hz:g} Hz", f"runs at {robot.rate_hz:g} Hz"))
+    for trained, term in zip(contract.observation, agent.observation, strict=False):
         bounds = [trained.low, trained.high], [term.low, term.high]
-        if trained.low and term.low and not np.allclose(*bounds, rtol=1e-6):
-            raise Sim2RealError(
-                f"the policy {where} was trained with {trained.name!r} from {trained.low} to {trained.high}, "
-                f"this robot has {term.low} to {term.high}",
-                hint=_TRAIN,
-            )
-    for action, limit in zip(contract.action, robot.agent.action, strict=True):
+        if not rows and trained.low and term.low and not np.allclose(*bounds, rtol=1e-6):
+            trains = f"was trained with {trained.name!r} from {trained.low} to {trained.high}"
+            rows.append((trains, f"has {term.low} to {term.high}"))
+    for action, limit in zip(contract.action, agent.action, strict=False):
         # Training rounds the limits to float32.
         if action.low < np.float32(limit.low) or action.high > np.float32(limit.high):
-            raise Sim2RealError(
-                f"the policy {where} sends {action.name!r} from {action.low:g} to {action.high:g} {action.unit}, "
-                f"this robot allows {limit.low:g} to {limit.high:g}",
-                hint=_TRAIN,
-            )
+            sends = f"sends {action.name!r} from {action.low:g} to {action.high:g} {action.unit}"
+            rows.append((sends, f"allows {limit.low:g} to {limit.high:g}"))
     for name, value in contract.limits.items():
-        if name not in robot.agent.limits or not np.isclose(value, robot.agent.limits[name], rtol=1e-6):
-            raise Sim2RealError(
-                f"the policy {where} was trained with {name!r} = {value:g}, "
-                f"this robot has {robot.agent.limits.get(name, 'no such limit')}",
-                hint=_TRAIN,
-            )
+        if name not in agent.limits or not np.isclose(value, agent.limits[name], rtol=1e-6):
+            rows.append((f"was trained with {name!r} = {value:g}", f"has {agent.limits.get(name, 'no such limit')}"))
+    if rows:
+        raise Sim2RealError(f"the policy {where} {rows[0][0]}, this robot {rows[0][1]}", hint=_TRAIN)
 
 
-def _require_robot(robot: RecordedRobot, bundle: Bundle, config: DeployConfig) -> None:
-    """Refuse a policy of another robot: of another pipeline, or of the emulated one on a port, and the reverse."""
-    trained, port = bundle.contract.robot, bundle.contract.port
-    where = f" in {bundle.path}" if bundle.path else ""
-    if trained and robot.folder is not None and trained != robot.name:
-        raise Sim2RealError(f"the policy{where} was trained for {trained!r}, this is {robot.name!r}", hint=_TRAIN)
-    if not port or (port == _EMBEDDED) == (config.port == _EMBEDDED):
-        return
+def _refuse_port(trained: str, config: DeployConfig, where: str) -> None:
+    """Refuse a policy of the emulated robot on a port, and the reverse; with ``force`` warn."""
     names = {True: "the emulated robot", False: "a robot"}
     message = (
-        f"the policy{where} was trained with parameters of {names[port == _EMBEDDED]} (port {port}), and port "
+        f"the policy {where} was trained with parameters of {names[trained == _EMBEDDED]} (port {trained}), and port "
         f"{config.port} has {names[config.port == _EMBEDDED]}"
     )
     if not config.force:
@@ -293,11 +275,3 @@ def _require_robot(robot: RecordedRobot, bundle: Bundle, config: DeployConfig) -
             message, hint="record, identify and train with the robot on this port; to deploy all the same: --force"
         )
     note(f"warning: {message}")
-
-
-def _observations(terms: Sequence[ObservationTerm]) -> list[tuple[str, tuple[str, ...], int]]:
-    return [(t.name, tuple(t.units), t.history) for t in terms]
-
-
-def _actions(terms: Sequence[ActionTerm]) -> list[tuple[str, str]]:
-    return [(t.name, t.unit) for t in terms]

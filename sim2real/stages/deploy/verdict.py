@@ -1,6 +1,9 @@
-"""The verdict on a deployment: the model tested on the deployment's logs, drift of the robot, timing and success."""
+"""The verdict on a deployment: model, robot, timing and success; and the command that follows from it."""
+
+from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,11 +14,13 @@ from sim2real.artifacts.bundle import GOOD_SUCCESS, Bundle
 from sim2real.artifacts.deployment import AS_HERE, Advice, Changed, Deployment, Drift, Gap, Replay
 from sim2real.artifacts.identification import MAX_ERROR_RATIO, ROUND_TRIP, Identification
 from sim2real.artifacts.recording import Recording
+from sim2real.artifacts.run import MANIFEST
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import OtherMotion, Sim2RealError
 from sim2real.installation import has_jax
-from sim2real.robots.robot import RecordedRobot
-from sim2real.stages.deploy.next_command import LATER, PAUSED, with_command
+from sim2real.robots.robot import RecordedRobot, in_world
+from sim2real.stages.load import defaults_of
+from sim2real.stages.shared.identification import command
 from sim2real.stages.terminal.console import progress, shown
 from sim2real.stages.terminal.interruption import patiently
 
@@ -32,6 +37,10 @@ _MAX_PAUSES_S = 0.1
 """Longest time that an episode may lose in pauses; a policy that then fails is not judged."""
 _MAX_SUCCESS_GAP = 0.1
 """Largest difference of success in simulation and on the robot."""
+_LATER, _PAUSED = "take longer than", "to pauses of its nodes"
+"""Words of the reasons for new timing in training, and for another deployment."""
+_ENOUGH_S = 12.0
+"""Length of a deployment's logs that suffices to identify from [s]."""
 
 
 def judge(
@@ -43,44 +52,57 @@ def judge(
         identification: The model; None: it is not tested.
         folder: Folder of the deployment, for the next command.
     """
-
-    def advised(judged: Deployment, advice: Advice) -> Deployment:
-        return replace(judged, advice=with_command(advice, robot, identification, folder, judged))
-
-    times = tuple(_times_of_training(deployment, bundle))
-    deployment = replace(deployment, trained=times)
+    deployment = replace(deployment, trained=tuple(_times_of_training(deployment, bundle)))
     if identification is None:
-        reason = "this run has no identification, so there is no model to compare with"
-        if not any(deployment.simulated):
-            return advised(deployment, Advice("not judged", (reason,)))
-        # A simulation with nominal parameters judges the policy alone.
-        advice = _policy_advice(deployment, bundle) or Advice("fine", ("the policy succeeds, as in simulation",))
-        return advised(deployment, replace(advice, reasons=(*advice.reasons, reason)))
-    # Test the model on the deployment's logs. A test that fails must not lose the deployment.
-    try:
-        if not has_jax():
-            log = shown(deployment.logs[0].path)
-            raise Sim2RealError(f"a computer with JAX tests the model: `sim2real validate RUN/identify --log {log}`")
-        from sim2real.stages.deploy.replay import tested
+        advice = Advice("not judged", ("this run has no identification, so there is no model to compare with",))
+        if any(deployment.simulated):  # with nominal parameters
+            advice = _of_policy(deployment, bundle, advice.reasons[0], fine=True)
+    else:
+        # A test that fails must not lose the deployment.
+        try:
+            deployment = _tested(deployment, robot, identification)
+            advice = verdict(deployment, bundle)
+        except OtherMotion as error:
+            reason = f"the deployment does not test the model: {error.args[0]}"
+            advice = _of_policy(deployment, bundle, reason, fine=True)
+        except (Sim2RealError, ArithmeticError, np.linalg.LinAlgError) as error:
+            advice = _of_policy(deployment, bundle, str(error.args[0]), fine=False)
+    return replace(deployment, advice=with_command(advice, robot, identification, folder, deployment))
 
-        with progress(None, "test the model on the deployment"):
-            replay, drift = patiently(lambda: tested(robot, identification, [r.episode for r in deployment.logs]))
-    except OtherMotion as error:
-        # The policy alone is judged, beside its simulation with identified parameters.
-        advice = _policy_advice(deployment, bundle) or Advice("fine", ("the policy succeeds, as in simulation",))
-        reason = f"the deployment does not test the model: {error.args[0]}"
-        return advised(deployment, replace(advice, reasons=(*advice.reasons, reason)))
-    except (Sim2RealError, ArithmeticError, np.linalg.LinAlgError) as error:
-        advice, reason = _policy_advice(deployment, bundle), str(error.args[0])
-        if advice is None:
-            return advised(deployment, Advice("not judged", (reason,)))
-        return advised(deployment, replace(advice, reasons=(*advice.reasons, reason)))
+
+def _of_policy(deployment: Deployment, bundle: Bundle, reason: str, fine: bool) -> Advice:
+    """Return the verdict where the model is not tested.
+
+    Args:
+        reason: Why it is not.
+        fine: Whether the policy is beside a simulation, so that its success suffices.
+    """
+    advice = _policy_advice(deployment, bundle)
+    if advice is None and not fine:
+        return Advice("not judged", (reason,))
+    advice = advice or Advice("fine", ("the policy succeeds, as in simulation",))
+    return replace(advice, reasons=(*advice.reasons, reason))
+
+
+def _tested(deployment: Deployment, robot: RecordedRobot, identification: Identification) -> Deployment:
+    """Return a deployment with the tests of the model on its logs."""
+    if not has_jax():
+        log = shown(deployment.logs[0].path)
+        raise Sim2RealError(f"a computer with JAX tests the model: `sim2real validate RUN/identify --log {log}`")
+    from sim2real.stages.deploy.replay import tested
+
+    with progress(None, "test the model on the deployment"):
+        replay, drift = patiently(lambda: tested(robot, identification, [r.episode for r in deployment.logs]))
     # The drift test estimates the present sum of the delays, unless the change is that of another parameter.
     other_changed = drift.named is not None and drift.named.name != ROUND_TRIP
-    round_trip_s = None if other_changed else {c.name: c.now for c in drift.changes}.get(ROUND_TRIP)
-    times = tuple(_with_real(t, round_trip_s) if t.quantity == f"{ROUND_TRIP}_s" else t for t in times)
-    deployment = replace(deployment, trained=times, replay=tuple(replay), drift=drift)
-    return advised(deployment, verdict(deployment, bundle))
+    now = None if other_changed else {c.name: c.now for c in drift.changes}.get(ROUND_TRIP)
+    trained = tuple(
+        replace(t, real=now, gap=now - t.simulation)
+        if t.quantity == f"{ROUND_TRIP}_s" and now is not None and t.simulation is not None
+        else t
+        for t in deployment.trained
+    )
+    return replace(deployment, trained=trained, replay=tuple(replay), drift=drift)
 
 
 def verdict(deployment: Deployment, bundle: Bundle) -> Advice:
@@ -104,21 +126,12 @@ def verdict(deployment: Deployment, bundle: Bundle) -> Advice:
             return Advice("fine", ("the robot is the one that was identified, and the policy succeeds", *late))
         return Advice("fine", ("the robot is the one that was identified, and as fast as in training",))
     if (lost_s := max(map(_lost_s, deployment.recordings), default=0.0)) > _MAX_PAUSES_S:
-        pause = f"an episode lost {lost_s:.2g} s {PAUSED}, and no simulation has such pauses"
+        pause = f"an episode lost {lost_s:.2g} s {_PAUSED}, and no simulation has such pauses"
         return replace(policy, status="not judged", reasons=(pause, *policy.reasons, "the model holds"))
     return replace(policy, reasons=(*policy.reasons, "the model holds"))
 
 
-def _lost_s(recording: Recording) -> float:
-    """Return the time that the slowest node of an episode lost in steps of two periods or more [s]."""
-    lost_s = [0.0]
-    for steps in recording.episode.steps.values():
-        # A step that is a little late is no pause: the node returns to its schedule.
-        gaps_s = np.diff(steps.begun_s)
-        if gaps_s.size:
-            period_s = float(np.median(gaps_s))
-            lost_s.append(float(np.sum(gaps_s[gaps_s >= 2.0 * period_s] - period_s)))
-    return max(lost_s)
+# -- the model
 
 
 def model_advice(replay: Sequence[Replay], drift: Drift | None) -> Advice | None:
@@ -137,74 +150,14 @@ def model_advice(replay: Sequence[Replay], drift: Drift | None) -> Advice | None
         reason = f"no parameters explain how {worst.name} moves: {_error(worst, AS_HERE)}"
         return Advice("look at this joint", (reason, "it may be loose, blocked, or touch something"), joint=worst.name)
     if drift is not None and (named := drift.named):
-        return Advice("re-identify", (f"the robot has changed: {_change(named)}", *_other_alarms(drift)))
+        others = ", ".join(name for name in drift.alarms if name != named.name)
+        less = [f"less likely, each alone: {others}"] if others else []
+        return Advice("re-identify", (f"the robot has changed: {_change(named)}", *less))
     if wrong := [r for r in replay if _error_ratio(r, "identified") > MAX_ERROR_RATIO]:
         likely = drift.likely if drift else None
         guess = [f"most likely the robot has changed: {_change(likely)}"] if likely else []
         return Advice("re-identify", (*(f"{r.name}: {_error(r, 'identified')}" for r in wrong), *guess))
     return None
-
-
-def _policy_advice(deployment: Deployment, bundle: Bundle) -> Advice | None:
-    """Return the finding about the policy; None if it succeeds often enough.
-
-    Steps that take longer than in training explain a failure; they are none. Where nothing measures success, they are
-    all that is known.
-    """
-    late = tuple(_late_nodes(deployment, bundle))
-    success = next((g for g in deployment.gap if g.quantity == "success"), None)
-    if success is None or success.real is None:
-        return Advice("re-train", late) if late else None
-    simulated = success.simulation if success.simulation is not None else 1.0
-    if success.real < min(GOOD_SUCCESS, simulated - _MAX_SUCCESS_GAP):
-        return Advice("re-train", (*late, f"success is {success.real:.2f}, in simulation {simulated:.2f}"))
-    if success.real < GOOD_SUCCESS:
-        return Advice("re-train", (*late, f"success is {success.real:.2f}, as in simulation"))
-    return None
-
-
-def _times_of_training(deployment: Deployment, bundle: Bundle) -> list[Gap]:
-    """Return the robot's times beside those of training: the sum of the delays, and each node's computation time."""
-    rows = []
-    if delays := bundle.contract.delays_s:
-        rows.append(Gap(f"{ROUND_TRIP}_s", None, float(sum(delays.values())), None, "s"))
-    steps = _computation_times(deployment)
-    for node, drawn in (bundle.episodes.drawn_s if bundle.episodes else {}).items():
-        if node in steps and drawn.size and steps[node].size:
-            for label, q in (("p50", 0.5), ("p99", 0.99)):
-                real, trained = float(np.quantile(steps[node], q)), float(np.quantile(drawn, q))
-                rows.append(Gap(f"step_of_{node}_{label}_s", real, trained, real - trained, "s"))
-    return rows
-
-
-def _computation_times(deployment: Deployment) -> dict[str, np.ndarray]:
-    """Return the computation times of each node's steps in all episodes ``(N,)`` [s]."""
-    parts: dict[str, list[np.ndarray]] = {}
-    for recording in deployment.recordings:
-        for node, times_s in Timing.of(recording.episode).steps_s.items():
-            parts.setdefault(node, []).append(times_s)
-    return {node: np.concatenate(times_s) for node, times_s in parts.items()}
-
-
-def _with_real(row: Gap, real: float | None) -> Gap:
-    """Return a row of times with the robot's value and the gap."""
-    if real is None or row.simulation is None:
-        return row
-    return replace(row, real=real, gap=real - row.simulation)
-
-
-def _late_nodes(deployment: Deployment, bundle: Bundle) -> list[str]:
-    """Return a sentence for each node whose steps take longer than in training."""
-    sentences, slack_s = [], _LATENESS_PERIODS / bundle.contract.rate_hz
-    for node, times_s in _computation_times(deployment).items():
-        drawn_s = bundle.episodes.drawn_s.get(node) if bundle.episodes else None
-        if drawn_s is None or not drawn_s.size or not times_s.size:
-            continue
-        longest_s = float(drawn_s.max())
-        share = float(np.mean(times_s > longest_s + slack_s))
-        if share > _MAX_LATE_SHARE:
-            sentences.append(f"{share:.1%} of the steps of {node} {LATER} the {1e3 * longest_s:.1f} ms of training")
-    return sentences
 
 
 def _error_ratio(row: Replay, model: str) -> float:
@@ -227,6 +180,147 @@ def _change(c: Changed) -> str:
     return f"{c.name} is {c.now:.4g} {c.unit} [{c.low95:.4g}, {c.high95:.4g}], identified were {c.before:.4g}"
 
 
-def _other_alarms(drift: Drift) -> list[str]:
-    others = ", ".join(name for name in drift.alarms if drift.named is None or name != drift.named.name)
-    return [f"less likely, each alone: {others}"] if others else []
+# -- the policy, and the times of its nodes
+
+
+def _policy_advice(deployment: Deployment, bundle: Bundle) -> Advice | None:
+    """Return the finding about the policy; None if it succeeds often enough.
+
+    Steps that take longer than in training explain a failure; they are none. Where nothing measures success, they are
+    all that is known.
+    """
+    late = tuple(_late_nodes(deployment, bundle))
+    success = next((g for g in deployment.gap if g.quantity == "success"), None)
+    if success is None or success.real is None:
+        return Advice("re-train", late) if late else None
+    simulated = success.simulation if success.simulation is not None else 1.0
+    if success.real < min(GOOD_SUCCESS, simulated - _MAX_SUCCESS_GAP):
+        return Advice("re-train", (*late, f"success is {success.real:.2f}, in simulation {simulated:.2f}"))
+    if success.real < GOOD_SUCCESS:
+        return Advice("re-train", (*late, f"success is {success.real:.2f}, as in simulation"))
+    return None
+
+
+def _lost_s(recording: Recording) -> float:
+    """Return the time that the slowest node of an episode lost in steps of two periods or more [s]."""
+    lost_s = [0.0]
+    for steps in recording.episode.steps.values():
+        # A step that is a little late is no pause: the node returns to its schedule.
+        gaps_s = np.diff(steps.begun_s)
+        if gaps_s.size:
+            period_s = float(np.median(gaps_s))
+            lost_s.append(float(np.sum(gaps_s[gaps_s >= 2.0 * period_s] - period_s)))
+    return max(lost_s)
+
+
+def _times_of_training(deployment: Deployment, bundle: Bundle) -> list[Gap]:
+    """Return the robot's times beside those of training: the sum of the delays, and each node's computation time."""
+    rows = []
+    if delays := bundle.contract.delays_s:
+        rows.append(Gap(f"{ROUND_TRIP}_s", None, float(sum(delays.values())), None, "s"))
+    for node, (took_s, drawn_s) in _computation_times(deployment, bundle).items():
+        for label, q in (("p50", 0.5), ("p99", 0.99)):
+            real, trained = float(np.quantile(took_s, q)), float(np.quantile(drawn_s, q))
+            rows.append(Gap(f"step_of_{node}_{label}_s", real, trained, real - trained, "s"))
+    return rows
+
+
+def _late_nodes(deployment: Deployment, bundle: Bundle) -> list[str]:
+    """Return a sentence for each node whose steps take longer than in training."""
+    sentences, slack_s = [], _LATENESS_PERIODS / bundle.contract.rate_hz
+    for node, (took_s, drawn_s) in _computation_times(deployment, bundle).items():
+        longest_s = float(drawn_s.max())
+        share = float(np.mean(took_s > longest_s + slack_s))
+        if share > _MAX_LATE_SHARE:
+            sentences.append(f"{share:.1%} of the steps of {node} {_LATER} the {1e3 * longest_s:.1f} ms of training")
+    return sentences
+
+
+def _computation_times(deployment: Deployment, bundle: Bundle) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Return the computation times of each node's steps in all episodes, and in training ``(N,)`` [s]."""
+    times = {}
+    timings = [Timing.of(recording.episode).steps_s for recording in deployment.recordings]
+    for node, drawn_s in (bundle.episodes.drawn_s if bundle.episodes else {}).items():
+        took_s = np.concatenate([t[node] for t in timings if node in t] or [np.empty(0)])
+        if drawn_s.size and took_s.size:
+            times[node] = (took_s, drawn_s)
+    return times
+
+
+# -- the command to type next
+
+
+def with_command(
+    advice: Advice, robot: RecordedRobot, identification: Identification | None, folder: Path, deployment: Deployment
+) -> Advice:
+    """Return advice with the command that carries it out.
+
+    Args:
+        deployment: With its logs and the drift of the robot.
+    """
+    if advice.status == "fine" or advice.joint:
+        return advice
+    run = ["--run", shown(folder.parent)] if (folder / MANIFEST).is_file() else []
+    train = shlex.join(["sim2real", "train", robot.name, *run])
+    if identification is None:
+        return replace(advice, next=shlex.join(["sim2real", "identify", robot.name, *run]))
+    if advice.status == "not judged" and any(_PAUSED in reason for reason in advice.reasons):
+        return replace(advice, next=shlex.join(["sim2real", "deploy", robot.name, *run]))
+    usual = defaults_of(robot).identify
+    logs = logs_to_identify([r.path for r in deployment.logs], deployment.drift, identification, folder)
+    terms = terms_to_identify(usual.terms, robot, identification, deployment.drift)
+    # Without logs that suffice the robot is recorded first.
+    if advice.status == "not judged" or not logs:
+        record = shlex.join(["sim2real", "record", robot.name])
+        identify = shlex.join(["sim2real", "identify", robot.name, "--terms", terms])
+        return replace(advice, next=record if terms == usual.terms else f"{record} && {identify}")
+    identify = command(robot, replace(usual, log=logs, terms=terms), Path("runs"), shlex.join(run))
+    if advice.status == "re-identify":
+        return replace(advice, next=identify)
+    return replace(advice, next=f"{identify} && {train}" if needs_timing(advice) else train)
+
+
+def terms_to_identify(
+    configured: str, robot: RecordedRobot, identification: Identification, drift: Drift | None
+) -> str:
+    """Return the optional terms to identify with: those of the identification, and that of the parameter that changed.
+
+    A model without the changed term, such as a payload, bends its other parameters instead.
+
+    Args:
+        configured: ``terms`` of ``IdentifyConfig``.
+    """
+    if configured in ("auto", "all"):
+        return configured
+    robot, max_delay_s = in_world(robot, identification.world), defaults_of(robot).identify.max_delay_s
+    watched, default = robot.watched(max_delay_s).parameters, robot.identifiable(max_delay_s).parameters.terms
+    changed = (drift.named or drift.likely) if drift is not None else None
+    added = [p.term for p in watched if changed is not None and p.name == changed.name and p.term]
+    before = default if identification.terms is None else identification.terms
+    terms = tuple(dict.fromkeys([*before, *added]))
+    return configured if terms == default else ",".join(terms) or "none"
+
+
+def needs_timing(advice: Advice) -> bool:
+    """Return whether training needs timing from a newer log; it takes the timing of the identification."""
+    return advice.status == "re-train" and any(_LATER in reason for reason in advice.reasons)
+
+
+def logs_to_identify(
+    deployed: Sequence[Path], drift: Drift | None, identification: Identification, folder: Path
+) -> tuple[str, ...]:
+    """Return the logs to identify from: the deployment's, and those of the identification if the robot has not changed.
+
+    Args:
+        deployed: Logs of the deployment.
+        folder: Folder of the deployment; the identification names its logs relative to the run.
+
+    Returns:
+        Paths, the deployment's first, because training takes its timing from the first; empty if the logs are too
+        short.
+    """
+    logs = tuple(shown(path) for path in deployed)
+    if drift is not None and (drift.alarms or drift.likely):
+        return logs if drift.seconds >= _ENOUGH_S else ()
+    identified = (folder.parent / log.path for log in identification.logs)
+    return (*logs, *(shown(path) for path in identified if path.is_file()))

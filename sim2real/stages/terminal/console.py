@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import io
 import re
+import shutil
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from sim2real.artifacts.paths import shown as shown
 
@@ -22,59 +22,20 @@ _TICK_S = 1.0
 """Period of a terminal's progress display [s]."""
 _LINES_S = (1.0, 2.0, 4.0, 8.0, 15.0)
 """When a log file gets a line of progress [s after its start]; after the last one, a line each time as long again."""
+_ANEW_S = 0.1
+"""Shortest time between two displays on a terminal [s]."""
+_CLEAR = "\r\033[K"
 
 # Characters that control a terminal: control characters except line feed and tab, and changes of text direction.
 _ACTS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
-@dataclass
-class HeldOutput:
-    """Output that is held back while a command prints few lines.
-
-    Attributes:
-        terminal: Whether stderr is a terminal.
-        activity: Text of the latest progress display.
-    """
-
-    text: io.StringIO
-    terminal: bool
-    activity: str = ""
-
-
-_held: HeldOutput | None = None
-
-
-def hold(held: HeldOutput | None) -> None:
-    """Hold notes and progress back from now on; None: print them again."""
-    global _held
-    _held = held
-
-
-class _Silent:
-    """Progress that only names the present activity."""
-
-    def __init__(self, held: HeldOutput, total: float | None, desc: str) -> None:
-        self.n: float = 0
-        self.total = total
-        self._held = held
-        held.activity = desc
-
-    def update(self, n: float = 1) -> None:
-        self.n += n
-
-    def refresh(self) -> None:
-        """Do nothing: the holder of the output shows that time passes."""
-
-    def set_description_str(self, desc: str) -> None:
-        self._held.activity = desc
-
-    def set_postfix_str(self, s: str) -> None:
-        """Do nothing: an intermediate result is a detail."""
-
-
 def clean(text: str) -> str:
     """Return a text with control sequences escaped: names in foreign files must not control the user's terminal."""
     return _ACTS.sub(lambda match: match[0].encode("unicode_escape").decode(), text)
+
+
+# -- results
 
 
 def table(rows: Iterable[Sequence[Any]], headers: Sequence[str] | None = None) -> str:
@@ -113,144 +74,6 @@ def pairs(values: Mapping[str, Any]) -> str:
     return "\n".join(line.rstrip() for line in table([[name, _cell(v)] for name, v in values.items()]).splitlines())
 
 
-class Bar(Protocol):
-    """A progress display; the part of tqdm's interface that is used."""
-
-    n: float
-    total: float | None
-
-    def update(self, n: float = 1) -> Any:
-        """Add steps that were done."""
-        ...
-
-    def refresh(self) -> Any:
-        """Show the present state."""
-        ...
-
-    def set_description_str(self, desc: str) -> None:
-        """Set the description of the activity."""
-        ...
-
-    def set_postfix_str(self, s: str) -> None:
-        """Set the text after the bar, e.g. an intermediate result."""
-        ...
-
-
-@contextmanager
-def progress(total: float | None, desc: str, shown: bool = True) -> Iterator[Bar]:
-    """Show a progress bar on stderr, or plain lines if that is not a terminal (a log file).
-
-    The time goes on while one step takes long: on a terminal every second, in a log file after 1, 2, 4, 8, 15 s and
-    then every 15 s.
-
-    Args:
-        total: Number of steps; None if unknown.
-        shown: False shows nothing: another process does.
-    """
-    # Within a brief stage, only its activity changes.
-    if _held is not None:
-        yield _Silent(_held, total, desc)
-        return
-    if sys.stderr.isatty() or not shown:
-        from tqdm import tqdm  # not needed for --help
-
-        # Without a total there is nothing to count: the time alone.
-        look = None if total else "{desc}: {elapsed}{postfix}"
-        bar = tqdm(total=total, desc=desc, file=sys.stderr, leave=False, disable=not shown, bar_format=look)
-        with bar, ticking(bar.refresh):
-            yield bar
-        return
-    # Without a terminal, print lines.
-    lines = _Lines(total, desc)
-    try:
-        with ticking(lines.refresh):
-            yield lines
-    except BaseException:
-        lines.end("ended")
-        raise
-    lines.end("finished")
-
-
-@contextmanager
-def ticking(tick: Callable[[], object]) -> Iterator[None]:
-    """Call a function every second, in a thread, while the block runs."""
-    ended = threading.Event()
-
-    def run() -> None:
-        while not ended.wait(_TICK_S):
-            tick()
-
-    thread = threading.Thread(target=run, name="progress", daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join()
-
-
-class _Lines:
-    """Progress as lines of text: one at the start, one at the end, and fewer and fewer in between."""
-
-    def __init__(self, total: float | None, desc: str) -> None:
-        self.n: float = 0
-        self.total = total
-        self._postfix = ""
-        self._lock = threading.Lock()
-        self._begin(desc)
-
-    def update(self, n: float = 1) -> None:
-        self.n += n
-        self.refresh()
-
-    def refresh(self) -> None:
-        with self._lock:
-            passed = time.monotonic() - self._begun_s
-            if passed < self._due_s:
-                return
-            last = _LINES_S[-1]
-            self._due_s = next((s for s in _LINES_S if s > passed), last * (passed // last + 1))
-            done = f"{self.n:g} of {self.total:g}" if self.total else f"{self.n:g}" if self.n else ""
-            note(f"{self._desc}: {', '.join(filter(None, [done, self._postfix, f'{passed:.0f} s so far']))}")
-
-    def set_description_str(self, desc: str) -> None:
-        if desc != self._desc:
-            self.end("finished")
-            self._begin(desc)
-
-    def set_postfix_str(self, s: str) -> None:
-        self._postfix = s
-
-    def _begin(self, desc: str) -> None:
-        self._desc = desc
-        self._begun_s, self._due_s = time.monotonic(), _LINES_S[0]
-        note(f"{desc}: started")
-
-    def end(self, how: str) -> None:
-        suffix = f" ({self._postfix})" if self._postfix else ""
-        note(f"{self._desc}: {how} after {time.monotonic() - self._begun_s:.1f} s{suffix}")
-
-
-def note(text: str, urgent: bool = False) -> None:
-    """Print a message on stderr, without breaking a progress bar.
-
-    Args:
-        urgent: Whether a person must act on it now: it is printed even where output is held back. Warnings are, too.
-    """
-    if _held is not None:
-        if not urgent and not text.startswith("warning:"):
-            _held.text.write(f"{clean(text)}\n")
-            return
-        sys.stderr.write("\n")  # the line of dots ends
-    if "tqdm" in sys.modules:
-        from tqdm import tqdm
-
-        tqdm.write(clean(text), file=sys.stderr)
-    else:
-        print(clean(text), file=sys.stderr)
-    sys.stderr.flush()
-
-
 def wrote(path: Path | str) -> None:
     """Print the name of a file or folder that was written, on stdout."""
     print(f"wrote {clean(shown(path))}", flush=True)
@@ -274,3 +97,169 @@ def _is_numeric(column: Sequence[Any]) -> bool:
     """Return whether a column has numbers only, apart from missing values."""
     values = [value for value in column if value is not None]
     return bool(values) and all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
+
+
+# -- messages and progress
+
+
+class Bar:
+    """Progress of an activity. A terminal shows it on one line, a log file gets fewer and fewer lines.
+
+    Attributes:
+        n: Steps that were done.
+    """
+
+    def __init__(self, total: float | None, desc: str, shown: bool = True) -> None:
+        self.n: float = 0
+        self._total, self._postfix, self._lock = total, "", threading.Lock()
+        self._shown, self._terminal = shown, sys.stderr.isatty()
+        self._begin(desc)
+
+    def update(self, n: float = 1) -> None:
+        """Add steps that were done."""
+        self.n += n
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Show the present state, where it is time."""
+        with self._lock:
+            passed_s = time.monotonic() - self._begun_s
+            if passed_s < self._due_s or not self._visible:
+                return
+            done = f"{self.n:g} of {self._total:g}" if self._total else f"{self.n:g}" if self.n else ""
+            text = f"{self._desc}: {', '.join(filter(None, [done, self._postfix, f'{passed_s:.0f} s so far']))}"
+            if self._terminal:
+                self._due_s = passed_s + _ANEW_S
+                _on_line(clean(text)[: shutil.get_terminal_size().columns - 1])
+            else:
+                last_s = _LINES_S[-1]
+                self._due_s = next((s for s in _LINES_S if s > passed_s), last_s * (passed_s // last_s + 1))
+                note(text)
+
+    def set_description_str(self, desc: str) -> None:
+        """Begin another part of the activity."""
+        if desc != self._desc:
+            self.end("finished")
+            self._begin(desc)
+
+    def set_postfix_str(self, text: str) -> None:
+        """Set a text such as an intermediate result."""
+        self._postfix = text
+
+    def end(self, how: str) -> None:
+        """Print how long it took; a terminal's line vanishes."""
+        if self._visible and self._terminal:
+            _on_line("")
+        elif self._visible:
+            suffix = f" ({self._postfix})" if self._postfix else ""
+            note(f"{self._desc}: {how} after {time.monotonic() - self._begun_s:.1f} s{suffix}")
+
+    def _begin(self, desc: str) -> None:
+        self._desc = desc
+        self._begun_s, self._due_s = time.monotonic(), 0.0 if self._terminal else _LINES_S[0]
+        if _brief is not None:
+            _brief.activity = desc
+        elif self._visible and not self._terminal:
+            note(f"{desc}: started")
+
+    @property
+    def _visible(self) -> bool:
+        return self._shown and _brief is None
+
+
+@contextmanager
+def progress(total: float | None, desc: str, shown: bool = True) -> Iterator[Bar]:
+    """Show progress on stderr. The time goes on while one step takes long.
+
+    Args:
+        total: Number of steps; None if unknown.
+        shown: False shows nothing: another process does.
+    """
+    bar = Bar(total, desc, shown)
+    try:
+        with _ticking(bar.refresh):
+            yield bar
+    except BaseException:
+        bar.end("ended")
+        raise
+    bar.end("finished")
+
+
+def note(text: str, urgent: bool = False) -> None:
+    """Print a message on stderr, without breaking a progress display.
+
+    Args:
+        urgent: Whether a person must act on it now: it is printed even where output is held back. Warnings are, too.
+    """
+    if _brief is not None:
+        if not urgent and not text.startswith("warning:"):
+            _brief.text.write(f"{clean(text)}\n")
+            return
+        sys.stderr.write("\n")  # the line of dots ends
+    elif sys.stderr.isatty():
+        sys.stderr.write(_CLEAR)
+    print(clean(text), file=sys.stderr, flush=True)
+
+
+def _on_line(text: str) -> None:
+    """Show a text in place of the terminal's last line."""
+    print(f"{_CLEAR}{text}", end="", file=sys.stderr, flush=True)
+
+
+class _Brief:
+    """Output that is held back: its text, and what is done at the moment."""
+
+    def __init__(self) -> None:
+        self.text, self.activity = io.StringIO(), ""
+
+
+_brief: _Brief | None = None
+
+
+@contextmanager
+def brief() -> Iterator[None]:
+    """Show a block on one line: hold back its tables, notes and progress, and print them if it fails.
+
+    Warnings, and notes that a person must act on, are printed. A terminal shows the seconds that have passed and the
+    present activity; a log file gets a dot each second, so that neither is silent.
+    """
+    global _brief
+    held, terminal, begun_s = _Brief(), sys.stderr.isatty(), time.monotonic()
+
+    def tick() -> None:
+        if terminal:
+            _on_line(f"  {time.monotonic() - begun_s:.0f} s  {held.activity}"[:100])
+        else:
+            print(".", end="", file=sys.stderr, flush=True)
+
+    print("  ", end="", file=sys.stderr, flush=True)
+    _brief = held
+    try:
+        with redirect_stdout(held.text), _ticking(tick):
+            yield
+    except BaseException:
+        # The details may name the cause: a person who asked for few lines needs them now.
+        sys.stderr.write(f"\n{held.text.getvalue()}")
+        raise
+    finally:
+        _brief = None
+    # Replace the display by the duration.
+    print(f"{f'{_CLEAR} ' if terminal else ''} {time.monotonic() - begun_s:.0f} s", file=sys.stderr, flush=True)
+
+
+@contextmanager
+def _ticking(tick: Callable[[], object]) -> Iterator[None]:
+    """Call a function every second, in a thread, while the block runs."""
+    ended = threading.Event()
+
+    def run() -> None:
+        while not ended.wait(_TICK_S):
+            tick()
+
+    thread = threading.Thread(target=run, name="progress", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()

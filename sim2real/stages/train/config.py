@@ -26,8 +26,6 @@ class LearningConfig:
     """Write the whole training into a file after each evaluation, to continue from with --resume."""
     view: ViewFlag = None
     """Show the curves in the Rerun viewer while the training runs; 'web': on a page for browsers."""
-    tensorboard: bool = False
-    """Write the curves for TensorBoard during the training, into the stage's folder 'tensorboard'."""
     hosts: HostsConfig = field(default_factory=HostsConfig)
     """Several processes, on this host or others, that make one training."""
     ppo: PPOConfig = field(default_factory=PPOConfig)

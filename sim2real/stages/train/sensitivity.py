@@ -17,7 +17,7 @@ from sim2real.identification.rollouts import jitted
 from sim2real.robots.loop import DELAYS, LoopTask, split_delay
 from sim2real.robots.robot import Robot
 from sim2real.stages.train.config import TrainConfig
-from sim2real.stages.train.training_setup import prepare
+from sim2real.stages.train.setup import prepare
 from sim2real.training.config import PPOConfig
 from sim2real.training.environment.graph_environment import GraphEnvironment
 from sim2real.training.environment.tasks import TrainingTask

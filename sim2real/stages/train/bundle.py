@@ -1,6 +1,8 @@
 """The bundle of a trained policy: contract, weights, graph, history, and JAX's actions to compare a runner with."""
 
-from collections.abc import Mapping
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -22,15 +24,19 @@ from sim2real.robots.loop import DELAYS, SENSOR
 from sim2real.robots.nodes import in_numpy
 from sim2real.robots.robot import Robot
 from sim2real.stages.train.config import TrainConfig
-from sim2real.stages.train.show import training_summary
-from sim2real.stages.train.training_setup import TrainingSetup
+from sim2real.stages.train.setup import TrainingSetup
+from sim2real.training.config import PPOConfig
 from sim2real.training.environment.tasks import TrainingTask
 from sim2real.training.networks.onnx_export import export_graph
 from sim2real.training.networks.policy import Policy
+from sim2real.training.ppo.result import Progress
 from sim2real.training.ppo.trainer import TrainResult
 from sim2real.training.sweep import Sweep, format_point
+from sim2real.types import Json
 
-MAX_OBSERVATIONS = 1000
+Watch = Callable[[Progress], None]
+"""A function that receives the figures of each evaluation."""
+_MAX_OBSERVATIONS = 1000
 """Number of observations of one source that are compared."""
 
 
@@ -47,32 +53,13 @@ def bundle_of_training(
     graph = export_graph(policy)
 
     # Observations: the last ones of the training, and those of a robot's recording.
-    observations = {"training": result.observations[:MAX_OBSERVATIONS]}
+    observations = {"training": result.observations[:_MAX_OBSERVATIONS]}
     if recording is not None and has_readings(setup.robot, recording):
         runner = make_runner(weights, contract, None, policy.spec, graph)
-        observations["log"] = observations_of(setup.robot, recording, runner)
-    references = {name: reference_of(policy, array) for name, array in observations.items()}
+        observations["log"] = _observations(setup.robot, recording, runner)
 
-    summary = {"model": config.model}
-    summary |= training_summary(result, config.ppo, Sweep.parse(config.sweep), setup.episodes)
-    summary |= {} if weakness is None else {"what breaks it": weakness.advice}
-    return Bundle(
-        contract=contract,
-        weights=weights,
-        history=_history(result),
-        episodes=setup.episodes,
-        path=None,
-        sensitivity=weakness,
-        spec=policy.spec,
-        graph=graph,
-        references=references,
-        summary=summary,
-    )
-
-
-def _history(result: TrainResult) -> History:
     curves = {name: np.asarray(v, np.float64) for name, v in result.history.items()}
-    return History(
+    history = History(
         steps=np.asarray(result.env_steps, np.float64),
         seconds=np.asarray(result.elapsed_s, np.float64),
         returns=curves.pop("return"),
@@ -84,12 +71,36 @@ def _history(result: TrainResult) -> History:
         settings=tuple(map(format_point, result.members)) if any(result.members) else (),
         others=curves,
     )
+    summary: dict[str, Json] = {"model": config.model}
+    summary |= training_summary(result, config.ppo, Sweep.parse(config.sweep), setup.episodes)
+    return Bundle(
+        contract=contract,
+        weights=weights,
+        history=history,
+        episodes=setup.episodes,
+        path=None,
+        sensitivity=weakness,
+        spec=policy.spec,
+        graph=graph,
+        references={name: _reference(policy, array) for name, array in observations.items()},
+        summary=summary if weakness is None else summary | {"what breaks it": weakness.advice},
+    )
+
+
+# -- the contract
 
 
 def contract_of(
     robot: Robot, task: TrainingTask, values: Mapping[str, float], episodes: Episodes | None = None
 ) -> PolicyContract:
     """Return the contract of a policy: observation, action, and the delays of its training."""
+    # The range of the round trip over the episodes, and the 1 and 99 % quantiles of each node's steps [s].
+    trained: dict[str, tuple[float, float]] = {}
+    if episodes is not None and set(DELAYS) <= set(values):
+        trips = np.append(episodes.draws.get(ROUND_TRIP, []), sum(values[n] for n in DELAYS))
+        trained[ROUND_TRIP] = (float(trips.min()), float(trips.max()))
+    for node, took_s in (episodes.drawn_s if episodes is not None else {}).items():
+        trained[node] = (float(np.quantile(took_s, 0.01)), float(np.quantile(took_s, 0.99)))
     return PolicyContract(
         observation=robot.agent.observation,
         action=tuple(
@@ -98,21 +109,13 @@ def contract_of(
         ),
         rate_hz=robot.rate_hz,
         delays_s={n: v for n, v in values.items() if n.endswith("_delay")},
-        trained_s={} if episodes is None else _trained(values, episodes),
+        trained_s=trained,
         limits=dict(robot.agent.limits),
         hashes={},
     )
 
 
-def _trained(values: Mapping[str, float], episodes: Episodes) -> dict[str, tuple[float, float]]:
-    """Return the range of the round trip over the episodes, and the 1 and 99 % quantiles of each node's steps [s]."""
-    trained: dict[str, tuple[float, float]] = {}
-    if set(DELAYS) <= set(values):
-        trips = np.append(episodes.draws.get(ROUND_TRIP, []), sum(values[n] for n in DELAYS))
-        trained[ROUND_TRIP] = (float(trips.min()), float(trips.max()))
-    for node, took_s in episodes.drawn_s.items():
-        trained[node] = (float(np.quantile(took_s, 0.01)), float(np.quantile(took_s, 0.99)))
-    return trained
+# -- references
 
 
 def has_readings(robot: Robot, recording: Recording) -> bool:
@@ -120,16 +123,15 @@ def has_readings(robot: Robot, recording: Recording) -> bool:
     return set(named_leaves(robot.sensor.at_rest)) <= set(recording.episode.outputs.get(SENSOR, {}))
 
 
-def observations_of(robot: Robot, recording: Recording, runner: PolicyRunner) -> np.ndarray:
+def _observations(robot: Robot, recording: Recording, runner: PolicyRunner) -> np.ndarray:
     """Return the observations ``(N, O)`` that a policy would get from a recording's measurements."""
     agent: Any = robot.agent.make(robot.rate_hz)
-    sensor = SENSOR
     if not (hasattr(agent, "observe") and hasattr(agent, "act")):
         raise Sim2RealError(f"a {type(agent).__name__} has no `observe` and `act`, which a policy needs")
 
     # Arrange the recorded readings as the leaves of a message.
     leaves, form = jax.tree_util.tree_flatten(robot.sensor.at_rest)
-    columns = [recording.episode.outputs[sensor][name] for name in named_leaves(robot.sensor.at_rest)]
+    columns = [recording.episode.outputs[SENSOR][name] for name in named_leaves(robot.sensor.at_rest)]
     columns = [c.astype(np.float32).reshape(-1, *np.shape(leaf)) for c, leaf in zip(columns, leaves, strict=True)]
 
     # Play the agent over them.
@@ -137,17 +139,57 @@ def observations_of(robot: Robot, recording: Recording, runner: PolicyRunner) ->
     state = StepState(params=params, state=in_numpy(agent.init_state(None, GraphState(params={agent.name: params}))))
     observations, zero = [], np.zeros(1, np.float32)
     runner.reset()
-    for k in range(min(MAX_OBSERVATIONS, len(columns[0]))):
+    for k in range(min(_MAX_OBSERVATIONS, len(columns[0]))):
         message = jax.tree_util.tree_unflatten(form, [c[k : k + 1] for c in columns])
-        state = state.replace(inputs={sensor: InputState(np.array([k], np.int32), zero, zero, message)})
+        state = state.replace(inputs={SENSOR: InputState(np.array([k], np.int32), zero, zero, message)})
         observations.append(np.asarray(agent.observe(state), np.float32))
         state, _ = agent.act(state, runner(observations[-1]))
     return np.array(observations)
 
 
-def reference_of(policy: Policy, observations: np.ndarray) -> PolicyReference:
+def _reference(policy: Policy, observations: np.ndarray) -> PolicyReference:
     """Return JAX's actions for observations ``(N, O)``, as those of one episode."""
     # On the processor: an accelerator multiplies matrices with less precision, by 1e-3 of the range.
     policy, x = jax.device_put((policy, observations), jax.devices("cpu")[0])
     actions = jax.jit(lambda policy, x: jax.lax.scan(policy.step, policy.initial_carry(), x)[1])(policy, x)
     return PolicyReference(observations, np.asarray(actions))
+
+
+# -- the summary
+
+
+def training_summary(result: TrainResult, ppo: PPOConfig, sweep: Sweep, episodes: Episodes) -> dict[str, Json]:
+    """Return the figures of a training for its summary and its bundle."""
+    best, success = sweep.names(ppo.num_seeds)[result.best_seed], result.history["success"]
+    summary: dict[str, Json] = {
+        "success in simulation": f"{success.max():.2f} ({best})",
+        "policy steps": int(result.env_steps[-1]) * len(result.members),
+    }
+    if ppo.target is not None:
+        steps = f"{ppo.target:g} reached after {int(result.env_steps[-1]):,} policy steps of each seed"
+        missed = f"{ppo.target:g} not reached: {success[-1].max():.2f} at the end"
+        summary["target"] = missed if success[-1].max() < ppo.target else steps
+    summary |= {
+        "policy steps a second": round(result.env_steps_per_s),
+        "compile": f"{result.compile_s:.1f} s",
+        "train": f"{result.train_s:.1f} s",
+        "episodes that end at a pause": f"{episodes.cut} of {episodes.timelines}",
+        "timelines drawn again": episodes.again,
+        **disturbance_rows(episodes),
+    }
+    if episodes.follow:  # a curriculum that follows success
+        share, last = float(result.history["width"][-1][result.best_seed]), episodes.curriculum[1]
+        late = "" if share >= last - 1e-6 else f" of {last:g}: success did not stay above {episodes.follow:g}"
+        summary["share reached"] = f"{share:.2f}{late}"
+    return summary
+
+
+def disturbance_rows(episodes: Episodes) -> dict[str, Json]:
+    """Return texts on pushes and the curriculum; empty without them."""
+    rows: dict[str, Json] = {"pushes": f"{episodes.push_hz:g} a second for each joint"} if episodes.push_hz else {}
+    if episodes.curriculum != (1.0, 1.0):
+        first, last = episodes.curriculum
+        text = f"{first:g} of these differences at the first update, "
+        how = f"up to {last:g} while success is above {episodes.follow:g}"
+        rows["curriculum"] = text + (how if episodes.follow else f"{last:g} at the last one")
+    return rows
