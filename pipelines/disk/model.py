@@ -54,7 +54,6 @@ class DiskWorld(JointWorld):
     """The disk, driven by the ``actuator`` input."""
 
     def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> DiskParams:
-        """Return the parameters that the rig's simulator was published with."""
         del rng, graph_state
         return DiskParams(
             gain=28.0,
@@ -67,11 +66,9 @@ class DiskWorld(JointWorld):
         )
 
     def command(self, step_state: StepState) -> Any:
-        """Return the voltage during this tick [V]."""
         return step_state.inputs["actuator"][-1].data.action[0]
 
     def forces(self, params: DiskParams, position: Any, velocity: Any, command: Any) -> Forces:
-        """Return motor, gravity and friction."""
         p = params
         along = jnp.cos(position)
         radial = p.gravity * along + p.swing * velocity**2

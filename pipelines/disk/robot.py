@@ -25,7 +25,6 @@ class DiskRobot(LoggedRobot):
     delayed = "command to angle"
 
     def dynamics(self) -> list[Parameter]:
-        """Return what may be identified."""
 
         def optional(
             name: str, unit: str, nominal: float, low: float, high: float, about: str = "", leaf: str = "", **more: Any
@@ -50,12 +49,10 @@ class DiskRobot(LoggedRobot):
         ]
 
     def make_nodes(self) -> tuple[BaseNode, RecordedActuator, BaseNode]:
-        """Return sensor, actuator and world."""
         actuator = RecordedActuator("actuator", 40.0, Command(action=jnp.zeros(1)))
         return RecordedSensor("sensor", 40.0, Measurement, Encoder(0.0, 0.0)), actuator, DiskWorld("world", 200.0)
 
     def started(self, params: Mapping[str, Any], start: Any) -> dict[str, Any]:
-        """Return node parameters with a start where the encoder reads ``start`` and its rate."""
         encoder = params["sensor"]
         angle = encoder.angle(start[0])
         return super().started(params, jnp.stack([angle, start[1] / encoder.rate(angle, 1.0)]))

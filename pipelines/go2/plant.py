@@ -31,7 +31,6 @@ class Go2Body(LeggedBody):
         super().__init__(Path(__file__).with_name("go2.xml"), LEGS, LYING, 0.12, hidden, place)
 
     def truth(self) -> dict[str, object]:
-        """Return the hidden parameters by the names of an identification."""
         hidden, motors = self.hidden, [f"{leg}_{part}" for leg in LEGS for part in PARTS]
         each = {"damping": hidden.damping, "friction": hidden.dry, "armature": hidden.armature}
         return {

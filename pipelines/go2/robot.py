@@ -10,9 +10,8 @@ import jax.numpy as jnp
 
 from sim2real.robots.session import Embedded
 from sim2real.robots.walking.drive import LegMotors, Place
-from sim2real.robots.walking.moment import Moment
 from sim2real.robots.walking.robot import ComposedRobot
-from sim2real.robots.walking.task import Term
+from sim2real.robots.walking.task import Moment, Term
 
 from .plant import LEGS, LYING, PARTS, latencies
 
@@ -48,7 +47,6 @@ class Go2(ComposedRobot):
     )
 
     def terms(self) -> Mapping[str, Term]:
-        """Return the terms of the reward, per policy step."""
         return {
             "velocity": (1.5, Moment.tracks),
             "yaw rate": (0.75, Moment.turns),

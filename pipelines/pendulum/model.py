@@ -150,41 +150,33 @@ class PendulumWorld(JointWorld):
         super().__init__(name, rate, substep_s, **options)
 
     def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> PendulumParams:
-        """Return the nominal parameters."""
         del rng, graph_state
         return nominal_params()
 
     def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
-        """Return the initial angle and velocity that the parameters name."""
         start = super().init_state(rng, graph_state)
         return Measurement(th=start.position, thdot=start.velocity)
 
     def command(self, step_state: StepState) -> Any:
-        """Return the voltage during this tick [V]."""
         return step_state.inputs["actuator"][-1].data.action[0]
 
     def integrate(self, params: PendulumParams, state: Any, command: Any) -> Any:
-        """Return angle and velocity one tick later."""
         moved = super().integrate(params, JointState(state.th, state.thdot), command)
         return Measurement(th=moved.position, thdot=moved.velocity)
 
     def forces(self, params: PendulumParams, position: Any, velocity: Any, command: Any) -> Forces:
-        """Return motor and gravity, viscous friction with the back-EMF, and Coulomb friction."""
         del velocity
         p = params
         push = p.K / p.R * command + p.mass * GRAVITY * p.length * jnp.sin(position)
         return Forces(acceleration=push / p.J, damping=(p.b + p.K**2 / p.R) / p.J, dry=p.c / p.J)
 
     def confine(self, params: PendulumParams, state: JointState) -> JointState:
-        """Clip the speed."""
         return state.replace(velocity=jnp.clip(state.velocity, -params.max_speed, params.max_speed))
 
     def velocity(self, state: Any) -> Any:
-        """Return the angular velocity [rad/s]."""
         return state.thdot
 
     def with_velocity(self, state: Any, velocity: Array) -> Any:
-        """Return the state with another angular velocity [rad/s]."""
         return state.replace(thdot=velocity)
 
 

@@ -61,7 +61,6 @@ class HingeSensor(RobotSensor):
         return {HINGE: {"position": "th", "velocity": "thdot"}}
 
     def read(self, reading: Reading) -> Measurement:
-        """Return the sensor's message of a reading."""
         return Measurement(reading.position_rad[0], reading.velocity_rad_s[0])
 
 
@@ -78,7 +77,6 @@ class HingeDrive(RobotDrive):
 
     @cached_property
     def embedded(self) -> Embedded:
-        """The emulated pendulum. The stages never read its latencies; ``--reveal`` compares with them."""
         from sim2real.emulation.dynamixel import EmulatorConfig
 
         emulator = EmulatorConfig(
@@ -92,7 +90,6 @@ class HingeDrive(RobotDrive):
         return Embedded(f"{Path(__file__).with_name('plant.py')}:PendulumPlant", emulator)
 
     def connect(self, port: str, limits: GateLimits, truth_path: Path, seed: int, hanging: bool = False) -> Session:
-        """Open the servo, with torque off; see ``RobotDrive.connect``."""
 
         def device(port: str) -> DynamixelServos:
             return self.make_device(port, limits.servo_watchdog_s)
@@ -113,7 +110,6 @@ class HingeDrive(RobotDrive):
         return DynamixelServos(BusConfig.patient(port, 1_000_000, silence_s), [SERVO_ID], VoltageDrive(SUPPLY_V))
 
     def gate(self, limits: GateLimits) -> GateConfig:
-        """Return a gate that falls back to 0 V."""
         return limits.gate(limits.limit, joints=(HINGE,))
 
     def prepare(self, session: Session, settle_s: float) -> None:
@@ -155,11 +151,9 @@ class HingeAgent(RobotAgent):
     action = (ActionTerm("voltage", "V", -LIMIT_V, LIMIT_V),)
 
     def make(self, rate_hz: float, **options: Any) -> Agent:
-        """Return the policy's node."""
         return Agent("agent", rate_hz, **options)
 
     def params(self, start: EpisodeStart, policy: Any) -> AgentParams:
-        """Return the node's parameters: the policy alone."""
         del start
         return AgentParams(policy=policy)
 
@@ -170,20 +164,16 @@ class HingeModel(RobotModel):
     tick_s, causes = 1 / WORLD_HZ, causes()
 
     def dynamics(self) -> list[Parameter]:
-        """Return the groups of parameters that a log determines."""
         return dynamics()
 
     def make_world(self, resumed: bool = False) -> PendulumWorld:
-        """Return the world's node; all of its state is measured, so a resumed one is no other."""
         del resumed
         return PendulumWorld("world", WORLD_HZ)
 
     def params(self, values: Mapping[str, Any], start: EpisodeStart) -> PendulumParams:
-        """Return the world's parameters for values and a start."""
         return from_groups(values, jnp.concatenate([jnp.asarray(x) for x in (start.position, start.velocity)]))
 
     def following(self, values: Mapping[str, float]) -> Following:
-        """Return how the pendulum accelerates by its voltage."""
         from sim2real.hardware.safety.following import Following
 
         gain, gravity, damping, friction = (float(values[n]) for n in ("gain", "gravity", "damping", "friction"))
@@ -196,15 +186,12 @@ class HingeModel(RobotModel):
 
     @property
     def export_lead_s(self) -> float:
-        """Half a step of MuJoCo, which moves a joint as if a force had acted that earlier [s]."""
         return 0.5 * STEP_S
 
     def identified_mjcf(self, values: Mapping[str, Scalar]) -> str:
-        """Return the pendulum in MuJoCo; its actuator takes a voltage."""
         return mjcf_of(values)
 
     def plain_simulation(self, values: Mapping[str, float]) -> PlainSimulation:
-        """Return the pendulum with MuJoCo's forces and the integrator of its world."""
 
         def begin(start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             return start[:1], start[1:]
@@ -218,7 +205,6 @@ class SwingUp(RobotTask):
     """Swing up, and stay upright; every trial is the same."""
 
     def random(self, key: Key, draw: Draw) -> tuple[dict[str, Any], EpisodeStart]:
-        """Return values and a start: half of the episodes start hanging, half anywhere."""
         k_values, k_state, k_where = jax.random.split(key, 3)
         values = draw(k_values)
         anywhere = jax.random.uniform(k_state, (2,), minval=-1.0, maxval=1.0) * jnp.array([jnp.pi, 9.0])
@@ -227,12 +213,10 @@ class SwingUp(RobotTask):
         return values, EpisodeStart(start[:1], start[1:], jnp.zeros(0))
 
     def at_rest(self, trial: int) -> EpisodeStart:
-        """Return the start hanging at rest."""
         del trial
         return EpisodeStart(np.array([np.pi]), np.zeros(1), np.zeros(0))
 
     def reward(self, state: Measurement, action: jax.Array) -> dict[str, jax.Array]:
-        """Return minus the seed's cost: angle, speed that matters only near the top, and voltage."""
         th = state.th - 2 * jnp.pi * jnp.floor((state.th + jnp.pi) / (2 * jnp.pi))
         return {
             "angle": -(th**2),
@@ -241,7 +225,6 @@ class SwingUp(RobotTask):
         }
 
     def success(self, state: Measurement) -> jax.Array:
-        """Return whether the pendulum is upright."""
         return upright(state.th, state.thdot)
 
     def score(self, t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float]:

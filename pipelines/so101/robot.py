@@ -19,13 +19,10 @@ from sim2real.later import jax, jnp
 from sim2real.robots.messages import JointReading
 from sim2real.robots.probe import Probe
 from sim2real.robots.robot import Robot
-from sim2real.robots.servo.datasheet import StsSheet
-from sim2real.robots.servo.drive import JointSensor, ServoDrive
 from sim2real.robots.servo.model import Hand, ServoModel, friction_causes, goal_offsets, servo_parameters
-from sim2real.robots.servo.observation import ServoAgent
-from sim2real.robots.servo.servos import Servos
+from sim2real.robots.servo.servos import JointSensor, ServoDrive, Servos, StsSheet
 from sim2real.robots.servo.targets import target_tasks
-from sim2real.robots.servo.task import Aim, AimTask, ServoMoment, uniform
+from sim2real.robots.servo.task import Aim, AimTask, ServoAgent, ServoMoment, uniform
 from sim2real.robots.session import Embedded
 from sim2real.types import Array, Key
 

@@ -109,30 +109,24 @@ class ArmWorld(JointWorld):
     """Six servos, driven by the ``actuator`` input."""
 
     def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> ArmParams:
-        """Return rough values."""
         del rng, graph_state
         return nominal()
 
     def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> JointState:
-        """Return the initial positions and velocities that the parameters name."""
         params = (graph_state or GraphState()).params.get(self.name) or self.init_params(rng)
         return JointState(params.start[:6], params.start[6:])
 
     def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> JointState:
-        """Return the initial state."""
         return (graph_state or GraphState()).state.get(self.name) or self.init_state(rng, graph_state)
 
     def init_delays(self, rng: Any = None, graph_state: GraphState | None = None) -> dict[str, Any]:
-        """Return the delay of the goals, where the actuator's parameters set one."""
         del rng
         return command_delay(graph_state)
 
     def command(self, step_state: StepState) -> Any:
-        """Return the goals during this tick, ``(6,)`` [rad]."""
         return step_state.inputs["actuator"][-1].data.goal
 
     def forces(self, params: ArmParams, position: Any, velocity: Any, command: Any) -> Forces:
-        """Return what servos, weight, table and friction do."""
         p = params
         error = saturated(command + p.bias - position, p.saturation) + _weight(p, position)
         return Forces(
@@ -142,7 +136,6 @@ class ArmWorld(JointWorld):
         )
 
     def confine(self, params: ArmParams, state: JointState) -> JointState:
-        """Stop joints at their lower stops."""
         below = state.position < params.low
         return JointState(jnp.maximum(state.position, params.low), jnp.where(below, 0.0, state.velocity))
 
@@ -162,10 +155,8 @@ class Sensor(BaseNode):
     """The encoders."""
 
     def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Positions:
-        """Return zero."""
         del rng, graph_state
         return Positions(position=jnp.zeros(6))
 
     def step(self, step_state: StepState) -> tuple[StepState, Positions]:
-        """Read."""
         return step_state, Positions(position=step_state.inputs["world"][-1].data.position)

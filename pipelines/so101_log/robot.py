@@ -33,7 +33,6 @@ class SO101(LoggedRobot):
     burst = 1
 
     def dynamics(self) -> list[Parameter]:
-        """Return what may be identified."""
         linear: Any = "linear"
         rows = []
         for i, joint in enumerate(JOINTS):
@@ -67,7 +66,6 @@ class SO101(LoggedRobot):
         return rows
 
     def make_nodes(self) -> tuple[BaseNode, RecordedActuator, BaseNode]:
-        """Return sensor, actuator and world."""
         actuator = RecordedActuator("actuator", RATE_HZ, Goal(goal=jnp.zeros(6)))
         return Sensor("sensor", RATE_HZ), actuator, ArmWorld("world", WORLD_HZ, substep_s=0.0051)
 

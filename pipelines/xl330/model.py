@@ -79,16 +79,13 @@ class ServoWorld(JointWorld):
     """The servo with its arm, driven by the ``actuator`` input."""
 
     def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> ServoParams:
-        """Return rough values of an XL330."""
         del rng, graph_state
         return ServoParams()
 
     def command(self, step_state: StepState) -> Command:
-        """Return the servo's command during this tick."""
         return step_state.inputs["actuator"][-1].data
 
     def forces(self, params: ServoParams, position: Any, velocity: Any, command: Command) -> Forces:
-        """Return motor, weight and friction."""
         p = params
         on = command.enabled > 0.5
         duty = position_duty(command.goal, position, command.kp / KP_UNIT, COUNTS_PER_RAD, FULL_PWM)

@@ -28,7 +28,6 @@ class ServoOnArm(LoggedRobot):
     burst = 1
 
     def dynamics(self) -> list[Parameter]:
-        """Return what may be identified."""
         linear: Any = "linear"
         gone: Any = {"vanishes": True}
         return [
@@ -50,7 +49,6 @@ class ServoOnArm(LoggedRobot):
         ]
 
     def make_nodes(self) -> tuple[BaseNode, RecordedActuator, BaseNode]:
-        """Return sensor, actuator and world."""
         released = Command(jnp.float32(0.0), jnp.float32(0.0), jnp.float32(0.0))
         actuator = RecordedActuator("actuator", _FASTEST_HZ, released)
         return RecordedSensor("sensor", 200.0, Measurement), actuator, ServoWorld("world", 1 / self.tick_s)

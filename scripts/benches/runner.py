@@ -25,7 +25,7 @@ from sim2real.robots.agent import DirectAgent
 from sim2real.robots.loop import control_nodes
 from sim2real.robots.messages import Goals, JointReading
 from sim2real.robots.nodes import PolicyNode, ServoActuator, ServoSensor
-from sim2real.robots.walking.messages import LegCommand
+from sim2real.robots.walking.drive import LegCommand
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import realtime
 

@@ -362,7 +362,6 @@ class Run(Shown):
         return Deployment.load(self._stage("deploy"))
 
     def about(self) -> Mapping[str, Any]:
-        """Return the facts that a notebook shows: name -> value."""
         done = [stage for stage in STAGES if finished(self.folder, stage) is not None]
         return {"folder": shown(self.folder), "finished": ", ".join(done) or "nothing"}
 

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from sim2real.commands import flags
 from sim2real.commands.stages import examples_of
 from sim2real.errors import UsageError
-from sim2real.stages.flag import Flag
-from sim2real.stages.live.config import WINDOW, is_viewer
+from sim2real.stages.flag import WINDOW, Flag, is_viewer
 from sim2real.stages.load import available
 from sim2real.stages.shared.find_run import find_run
 
@@ -103,18 +102,18 @@ def report(run: str | Path | Run, runs: str | Path = "runs") -> Path:
 def _show(run_dir: Path, target: str, follow: bool) -> None:
     """Show a run in the viewer, or write a file for it."""
     from sim2real.artifacts.run import pipeline_of
-    from sim2real.stages.live import scene as scenes
+    from sim2real.stages import live
     from sim2real.stages.load import load_robot
     from sim2real.stages.terminal.console import wrote
     from sim2real.view.rerun_recording import view
 
     robot = load_robot(pipeline_of(run_dir))
-    scene = scenes.drawn(scenes.scene_of(robot))
+    scene = live.drawn(live.scene_of(robot))
     if follow:
-        scenes.follow(run_dir, robot.name, target, scene)
+        live.follow(run_dir, robot.name, target, scene)
         return
     save = Path(target) if target.endswith(".rrd") and "://" not in target else None
-    view(run_dir, save, scene, scenes.serve if target != WINDOW and save is None else None)
+    view(run_dir, save, scene, live.serve if target != WINDOW and save is None else None)
     if save is not None:
         wrote(save)
 

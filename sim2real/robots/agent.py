@@ -96,7 +96,6 @@ class PolicyAgent(BaseNode):
         return AgentParams(start=np.zeros(self._actions, np.float32))
 
     def init_state(self, rng: Key | None = None, graph_state: GraphState | None = None) -> AgentState:
-        """Return the commands at the start, and a history of zeros."""
         params = self._params(graph_state)
         start = np.zeros(self._actions) if params.start is None else params.start
         past, still = np.zeros((self._history, self._ends[-1]), np.float32), np.zeros(self._actions, np.float32)
@@ -104,7 +103,6 @@ class PolicyAgent(BaseNode):
         return AgentState(namespace(start).asarray(start, np.float32), still, still, past, carry)
 
     def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> PyTree:
-        """Return the message of the command at the start."""
         params = self._params(graph_state)
         start = np.zeros(self._actions) if params.start is None else params.start
         return self.message(namespace(start).asarray(start, np.float32), StepState(params=params, seq=0))
@@ -129,7 +127,6 @@ class PolicyAgent(BaseNode):
         return step_state.replace(state=new), self.message(command, step_state)
 
     def step(self, step_state: StepState) -> tuple[StepState, PyTree]:
-        """Make a step with the policy's action."""
         policy, state = step_state.params.policy, step_state.state
         if policy is None:
             return self.act(step_state, np.zeros(self._actions, np.float32))

@@ -58,7 +58,6 @@ class LoggedRobot(RecordedRobot):
         return {**params, WORLD: params[WORLD].replace(start=start)}
 
     def identifiable(self, max_delay_s: float) -> IdentifiableRecording:
-        """Return the model to identify, with a delay of up to ``max_delay_s`` [s]."""
         return IdentifiableRecording(self, max_delay_s)
 
     def in_model(self, model: RobotModel) -> Self:

@@ -326,27 +326,21 @@ class LoopTask(TrainingTask):
         return self.start[0] * drawn[0], self.start[1] * drawn[1]
 
     def observe(self, step_state: StepState) -> jax.Array:
-        """Return the policy's observation, made by the agent's node."""
         return self.agent.observe(step_state)
 
     def act(self, step_state: StepState, action: jax.Array) -> tuple[StepState, PyTree]:
-        """Return the agent's new step state and its message for an action."""
         return self.agent.act(step_state, action)
 
     def reward(self, graph_state: GraphState, action: jax.Array) -> Rewards:
-        """Return the robot's reward of a row."""
         return self.robot.task.reward(self.robot.task.judged(graph_state), action)
 
     def success(self, graph_state: GraphState) -> jax.Array:
-        """Return whether the task is fulfilled."""
         return self.robot.task.success(self.robot.task.judged(graph_state))
 
     def terminated(self, graph_state: GraphState) -> jax.Array:
-        """Return whether the robot's episode ended."""
         return self.robot.task.terminated(self.robot.task.judged(graph_state))
 
     def privileged(self, graph_state: GraphState) -> jax.Array:
-        """Return the true state of the world, and the parameters of the episode, shape ``(P,)``."""
         state = self.robot.model.true_state(graph_state.state[WORLD])
         numbers = [x for x in map(jnp.asarray, jax.tree.leaves((state, graph_state.params)))]
         numbers = [x for x in numbers if jnp.issubdtype(x.dtype, jnp.inexact)]

@@ -86,7 +86,6 @@ class SimSensor(BaseNode):
         return delay_of(self.name, self._world.name, graph_state)
 
     def init_state(self, rng: Key | None = None, graph_state: GraphState | None = None) -> PyTree:
-        """Return the biases of an episode, ``(noise,)``; without any noise there is no state."""
         if (sizes := self.data) is None:
             return super().init_state(rng, graph_state)
         drawn = jnp.zeros(len(self.noise)) if rng is None else jax.random.normal(rng, (len(self.noise),))
@@ -215,7 +214,6 @@ class ServoActuator(BaseNode):
         return self._message(np.zeros(len(self._rig.device.motors)))
 
     def startup(self, graph_state: GraphState, timeout: float | None = None) -> bool:
-        """Switch the torque on, and bring the robot to the start of the task."""
         self._rig.start()
         if self._begin is not None:
             self._begin()
@@ -223,7 +221,6 @@ class ServoActuator(BaseNode):
         return True
 
     def stop(self, timeout: float | None = None) -> bool:
-        """Switch the torque off."""
         self._rig.stop()
         return True
 
@@ -306,7 +303,6 @@ class PolicyNode(BaseNode):
         return in_numpy(self._agent.init_output(rng, graph_state))
 
     def startup(self, graph_state: GraphState, timeout: float | None = None) -> bool:
-        """Begin an episode."""
         self._runner.reset()
         return True
 

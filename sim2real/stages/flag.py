@@ -1,6 +1,9 @@
-"""How a field of a configuration appears on the command line, where its type alone does not decide it."""
+"""Flags of configurations: how a field appears on the command line, and flags of several stages. Imports no JAX."""
 
 from dataclasses import dataclass
+from typing import Annotated
+
+from sim2real.errors import UsageError
 
 
 @dataclass(frozen=True)
@@ -20,3 +23,30 @@ class Flag:
     flat: bool = False
     also: str = ""
     alone: str | None = None
+
+
+WINDOW = "window"
+"""The viewer that ``--view`` without a value opens."""
+ViewFlag = Annotated[str | None, Flag("[web|ADDRESS|FILE.rrd]", alone=WINDOW)]
+
+
+def is_viewer(view: str) -> bool:
+    """Return whether a text names a viewer: ``window``, ``web``, an address, or a file of Rerun."""
+    return view == WINDOW or view.partition(":")[0] == "web" or "://" in view or view.endswith(".rrd")
+
+
+def check_view(view: str | None) -> None:
+    """Refuse a value of ``--view`` that is no viewer."""
+    if view is not None and not is_viewer(view):
+        raise UsageError(
+            f"--view {view} is no viewer",
+            hint="--view alone opens a window, --view web a page for browsers of this computer, --view web:0.0.0.0 one "
+            "for the network; an address such as rerun+http://HOST:9876/proxy is a viewer elsewhere, and FILE.rrd a "
+            "file",
+        )
+
+
+def check_seed(seed: int) -> None:
+    """Refuse a value that is no seed."""
+    if not 0 <= seed < 2**31:
+        raise UsageError(f"seed must lie in [0, 2**31), got {seed}")

@@ -120,7 +120,7 @@ from sim2real.robots.nodes import Excitation, ServoActuator, ServoSensor
 from sim2real.robots.loop import ACTUATOR, AGENT, SENSOR, control_nodes
 from sim2real.robots.messages import Goals
 from sim2real.robots.walking.drive import BodySensor
-from sim2real.robots.walking.messages import leg_command
+from sim2real.robots.walking.drive import leg_command
 from sim2real.runtime.asynchronous import AsyncGraph
 from pipelines.go2.plant import LYING
 

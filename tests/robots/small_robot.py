@@ -10,12 +10,9 @@ import numpy as np
 from sim2real.graph.base import GraphState, InputState, StepState
 from sim2real.robots.messages import EpisodeStart, Goals
 from sim2real.robots.robot import Robot
-from sim2real.robots.servo.datasheet import DataSheet
-from sim2real.robots.servo.drive import JointSensor, ServoDrive
 from sim2real.robots.servo.model import ServoModel
-from sim2real.robots.servo.observation import ServoAgent
-from sim2real.robots.servo.servos import Servos
-from sim2real.robots.servo.task import Aim, AimTask, uniform
+from sim2real.robots.servo.servos import DataSheet, JointSensor, ServoDrive, Servos
+from sim2real.robots.servo.task import Aim, AimTask, ServoAgent, uniform
 
 MJCF = Path(__file__).with_name("pair.xml")
 SHEET = DataSheet(stall=1.4, damping=0.2, armature=0.01, friction=0.02, p_gain=1200, profile_rad_s=2.0)

@@ -8,10 +8,9 @@ from pipelines.go2.robot import ROBOT
 from sim2real import composer
 from sim2real.errors import UsageError
 from sim2real.policy.bundle import load_bundle
-from sim2real.robots.walking.model import ROUGHNESS
-from sim2real.robots.walking.scene import Ground
-from sim2real.robots.walking.terrain import Terrain
+from sim2real.robots.walking.body import Terrain
 from sim2real.robots.walking.twin import Twin, walk
+from sim2real.robots.walking.world import ROUGHNESS, Ground
 
 SMALL = Terrain(most_m=0.06, cell_m=0.2, length_m=4.0)
 

@@ -10,7 +10,7 @@ from small_robot import SERVOS, SHEET, VALUES, PairRobot
 
 from sim2real.graph.episode import named_leaves
 from sim2real.robots.messages import Decision, EpisodeStart
-from sim2real.robots.servo.datasheet import DataSheet
+from sim2real.robots.servo.servos import DataSheet
 
 
 def slouching():

@@ -14,8 +14,8 @@ from sim2real import cli
 from sim2real.commands.play import PlayConfig, run
 from sim2real.errors import UsageError
 from sim2real.policy.bundle import load_bundle
-from sim2real.robots.walking.commands import Commands
-from sim2real.robots.walking.messages import gravity_of
+from sim2real.robots.walking.drive import gravity_of
+from sim2real.robots.walking.task import Commands
 from sim2real.robots.walking.twin import HiddenTwin, Twin, walk
 
 ROOT = Path(__file__).parents[2]

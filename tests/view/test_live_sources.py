@@ -11,7 +11,7 @@ import pytest
 from sim2real.artifacts.progress import BEST_FIT, PROGRESS, write_best_fit, write_progress
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode, Steps
-from sim2real.stages.live import viewer_process
+from sim2real.stages import live
 from sim2real.view.live.follower import Follower
 from sim2real.view.live.log_source import LogSource, _thinned
 from sim2real.view.live.stage_sources import FitSource, ProgressSource
@@ -198,9 +198,9 @@ def test_the_process_of_a_viewer_reports_an_error_and_its_hint_once(monkeypatch,
     def missing():
         raise Sim2RealError("Rerun is not installed", hint="install it")
 
-    monkeypatch.setattr(viewer_process, "rerun_module", missing)
-    monkeypatch.setattr(viewer_process.os, "nice", lambda increment: 0)
-    monkeypatch.setattr(viewer_process.os, "sched_setscheduler", lambda *args: None, raising=False)
+    monkeypatch.setattr(live, "rerun_module", missing)
+    monkeypatch.setattr(live.os, "nice", lambda increment: 0)
+    monkeypatch.setattr(live.os, "sched_setscheduler", lambda *args: None, raising=False)
     monkeypatch.setattr("sys.stdin", io.StringIO('{"name": "a", "target": "window", "folder": "."}\n'))
-    viewer_process.main()
+    live.main()
     assert json.loads(capsys.readouterr().out) == {"error": "Rerun is not installed", "hint": "install it"}

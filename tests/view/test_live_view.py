@@ -13,7 +13,7 @@ from sim2real import cli
 from sim2real.artifacts.run import newest
 from sim2real.errors import UsageError
 from sim2real.log.reader import read_log
-from sim2real.stages.live.config import check_view
+from sim2real.stages.flag import check_view
 
 
 def record(root, view, *, duration_s=2.0, pipeline="pendulum"):

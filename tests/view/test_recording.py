@@ -20,7 +20,7 @@ from installed import need
 from sim2real.artifacts.run import finished_stages
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import StepRecord, steps_from_records
-from sim2real.stages.live.scene import drawn, scene_of
+from sim2real.stages.live import drawn, scene_of
 from sim2real.stages.load import load_robot
 from sim2real.view.rerun_content import states_of, tabs_of
 from sim2real.view.rerun_recording import _COLORS, view

@@ -36,7 +36,7 @@ def record(
     from sim2real.emulation.legs import EmulatedLegs, UnitreeEmulation
     from sim2real.emulation.truth import TruthLog
     from sim2real.hardware.registry import load_named
-    from sim2real.robots.servo.drive import approached
+    from sim2real.robots.servo.servos import approached
     from sim2real.stages.load import load_robot
     from sim2real.stages.session.excitation import excitation
 
@@ -66,7 +66,7 @@ def record(
 def _play(path: Path, legs: Any, robot: Any, goals: np.ndarray, begin_ns: int, seed: int) -> None:
     """Write the log of a loop that sends targets ``(N, joints)`` [rad] from a time on [ns]."""
     from sim2real.hardware.unitree.legs import command
-    from sim2real.robots.walking.messages import BodyReading
+    from sim2real.robots.walking.drive import BodyReading
 
     # The times of the loop's steps; a measurement is the first state after its step's start.
     rng, count = np.random.default_rng([20261126, seed]), len(goals)
@@ -93,8 +93,7 @@ def _play(path: Path, legs: Any, robot: Any, goals: np.ndarray, begin_ns: int, s
 def _stand_up(legs: Any, robot: Any) -> int:
     """Let a robot on the floor stand up as before a deployment; return when it stands [ns]."""
     from sim2real.hardware.unitree.legs import command
-    from sim2real.robots.walking.drive import StandUp
-    from sim2real.robots.walking.messages import leg_command
+    from sim2real.robots.walking.drive import StandUp, leg_command
 
     motion, start = StandUp(), np.asarray(robot.motors.folded)
     for k in range(round(motion.duration_s * robot.rate_hz)):

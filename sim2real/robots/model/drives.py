@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -159,49 +159,36 @@ def held_in(path: Path, model: MjModel, joints: Sequence[str], fix_base: bool, h
     return plan(model, joints, hold, fix_base, path)
 
 
-@dataclass(frozen=True)
-class JointDrive:
-    """One actuator of a joint.
+def set_drive(
+    spec: MjSpec,
+    joint: str,
+    control: Literal["position", "velocity", "torque"],
+    stiffness: float,
+    damping: float,
+    gain: float,
+    most: float | None,
+) -> None:
+    """Give a joint of a model one actuator: the file's if it has any, otherwise a new one.
 
-    Attributes:
+    Args:
         control: Quantity of its control.
         stiffness: Gain of a position control [N m/rad].
         damping: Damping [N m s/rad]; also the gain of a velocity control.
         gain: Torque for each unit of a torque control [N m].
         most: Largest torque [N m]; None: no limit.
     """
-
-    control: Literal["position", "velocity", "torque"]
-    stiffness: float
-    damping: float
-    gain: float
-    most: float | None
-
-
-def set_drives(spec: MjSpec, drives: Mapping[str, JointDrive]) -> None:
-    """Give joints of a model one actuator each: the file's actuator if it has exactly one, otherwise a new one.
-
-    Args:
-        spec: ``mujoco.MjSpec`` of the model; it is changed.
-    """
-    # Leave one actuator on each joint, and set its gains.
-    fixed, affine = mj.mjtGain.mjGAIN_FIXED, mj.mjtBias.mjBIAS_AFFINE
-    for joint, drive in drives.items():
-        actuators = [a for a in spec.actuators if a.trntype == mj.mjtTrn.mjTRN_JOINT and a.target == joint]
-        for element in actuators[1:]:
-            spec.delete(element)
-        part: Any = (
-            actuators[0] if actuators else spec.add_actuator(name=joint, target=joint, trntype=mj.mjtTrn.mjTRN_JOINT)
-        )
-        gain = {"position": drive.stiffness, "velocity": drive.damping, "torque": drive.gain}[drive.control]
-        stiffness = drive.stiffness if drive.control == "position" else 0.0
-        part.gaintype, part.biastype, part.dyntype = fixed, affine, mj.mjtDyn.mjDYN_NONE
-        part.gear[:] = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
-        part.gainprm[:3], part.biasprm[:3] = [gain, 0.0, 0.0], [0.0, -stiffness, -drive.damping]
-        part.ctrllimited = False  # the file's range may be a torque
-        part.forcelimited = False
-        if drive.most is not None:  # at the joint, as in identification: MuJoCo then integrates damping implicitly
-            spec.joint(joint).actfrclimited, spec.joint(joint).actfrcrange = True, [-drive.most, drive.most]
+    actuators = [a for a in spec.actuators if a.trntype == mj.mjtTrn.mjTRN_JOINT and a.target == joint]
+    for element in actuators[1:]:
+        spec.delete(element)
+    part: Any = (
+        actuators[0] if actuators else spec.add_actuator(name=joint, target=joint, trntype=mj.mjtTrn.mjTRN_JOINT)
+    )
+    _clear(part)
+    part.gaintype, part.biastype = mj.mjtGain.mjGAIN_FIXED, mj.mjtBias.mjBIAS_AFFINE
+    part.gainprm[:3] = [{"position": stiffness, "velocity": damping, "torque": gain}[control], 0.0, 0.0]
+    part.biasprm[:3] = [0.0, -stiffness if control == "position" else 0.0, -damping]
+    if most is not None:  # at the joint, as in identification: MuJoCo then integrates damping implicitly
+        spec.joint(joint).actfrclimited, spec.joint(joint).actfrcrange = True, [-most, most]
 
 
 def limit_of(model: MjModel, joint: str) -> float | None:
@@ -307,18 +294,15 @@ class Encoders(BaseNode):
         self._world, self._velocity = world, velocity
 
     def init_params(self, rng: Key | None = None, graph_state: GraphState | None = None) -> EncoderParams:
-        """Return encoders that read 0 at the model's zero."""
         world = self._world.init_params(rng, graph_state)
         return EncoderParams(jnp.zeros(len(self._world.qpos_at)), world.terms)
 
     def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> Measured:
-        """Return zeros."""
         del rng, graph_state
         still = jnp.zeros(len(self._world.qpos_at))
         return Measured(still, still if self._velocity else None)
 
     def step(self, step_state: StepState) -> tuple[StepState, Measured]:
-        """Read."""
         message, params = step_state.inputs[self._world.name][-1].data, step_state.params
         angle, speed = message.qpos[self._world.qpos_at], message.qvel[self._world.qvel_at]
         if params.terms is not None:

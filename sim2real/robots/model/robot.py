@@ -13,7 +13,6 @@ import msgspec
 import mujoco
 import numpy as np
 
-from sim2real.arrays import beside_damping
 from sim2real.artifacts.files import check
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.episode import Episode
@@ -26,13 +25,12 @@ from sim2real.robots.loop import ACTUATOR, SENSOR
 from sim2real.robots.model.drives import (
     EncoderParams,
     Encoders,
-    JointDrive,
     copy_back,
     driven,
     driven_simulation,
     held_in,
     limit_of,
-    set_drives,
+    set_drive,
     slides_of,
     stick,
     unit_for,
@@ -46,9 +44,7 @@ from sim2real.robots.model.parameters import (
     ParameterAt,
     ParameterPattern,
     expand,
-    of_each,
     place,
-    tilted,
     with_optional,
 )
 from sim2real.types import MjModel, PyTree, Scalar
@@ -177,7 +173,6 @@ class MjcfRobot(LoggedRobot):
 
     @property
     def channels(self) -> tuple[Channel, ...]:
-        """The measured quantities of each joint."""
         c = self.config
         velocity, goal = ("velocity" if c.velocity else None), ("goal" if "goal" in c.commands else None)
         rows = enumerate(c.joints)
@@ -185,7 +180,6 @@ class MjcfRobot(LoggedRobot):
 
     @property
     def units(self) -> Mapping[str, str]:
-        """Field -> unit; entry of a field, such as ``position[0]``, where some joints are slides and others hinges."""
         units = {"position": "rad", "velocity": "rad/s", "goal": "rad", "goal_velocity": "rad/s", "torque": "N m"}
         there = {"position", *self.config.commands, *(["velocity"] if self.config.velocity else [])}
         units = {field: unit for field, unit in units.items() if field in there}
@@ -197,11 +191,9 @@ class MjcfRobot(LoggedRobot):
         return units | {field: unit for field, unit in OF_PAYLOAD.items() if field in self.config.commands}
 
     def dynamics(self) -> list[Parameter]:
-        """Return what may be identified."""
         return [p.parameter for p in self.placed]
 
     def make_nodes(self) -> tuple[BaseNode, RecordedActuator, DrivenWorld]:
-        """Return sensor, actuator and world."""
         config = self.config
         still = {n: jnp.zeros(1 if n in config.shared else len(config.joints)) for n in config.commands}
         units = config.kp_unit, config.kd_unit, config.volts_unit
@@ -237,7 +229,6 @@ class MjcfRobot(LoggedRobot):
         return MjcfRobot(replace(self.config, terms=tuple(terms))).called_like(self)
 
     def identifiable(self, max_delay_s: float) -> IdentifiableMjcf:
-        """Return the model to identify, with a delay of up to ``max_delay_s`` [s]."""
         return IdentifiableMjcf(self, max_delay_s)
 
     def base(self, params: DriveParams) -> DriveParams:
@@ -266,38 +257,42 @@ class MjcfRobot(LoggedRobot):
 
         Where the log has gains of its own in N m/rad they are the command's, and the file's own actuators stay.
         """
-        config, spec = self.config, read_spec(self.config.model)
+        config, commands, spec = self.config, self.config.commands, read_spec(self.config.model)
+        loop, named = self.identifiable(1.0), {p.what for p in self.placed}
+        world = loop.params(values, np.zeros(2 * len(config.joints)))["world"]
         spec.option.timestep, spec.option.integrator = config.step_s, mj.mjtIntegrator.mjINT_IMPLICITFAST
-        spec.option.gravity = np.asarray(tilted(self.placed, values, spec.option.gravity))
-        drives = self._drives(values)
+        if named & {"tilt_x", "tilt_y"}:
+            spec.option.gravity = np.asarray(world.model.opt.gravity, np.float64)
         stick(spec, config.joints, config.step_s)
-        if not ("kp" in config.commands and config.kp_unit == 1.0):
-            set_drives(spec, dict(zip(config.joints, drives, strict=True)))
+        if not ("kp" in commands and config.kp_unit == 1.0):
+            control = "position" if "goal" in commands else "velocity" if "goal_velocity" in commands else "torque"
+            most = np.asarray(world.model.jnt_actfrcrange)[loop.joints, 1].tolist()
+            limits = [m if m < NO_LIMIT else None for m in most] if "torque" in named else self._limits
+            gains = (np.asarray(rows, np.float64).tolist() for rows in (world.kp, world.kd, world.gain))
+            for joint, limit, *drive in zip(config.joints, limits, *gains, strict=True):
+                set_drive(spec, joint, control, *drive, limit)
+        # Copy what is identified of joints and bodies.
         model = spec.compile()
-        dofs = [model.joint(name).dofadr[0] for name in config.joints]
-        # A speed without load makes a damping of the torque limit, after a damping that was identified.
-        for p in sorted(self.placed, key=lambda p: p.what == "speed"):
-            each = np.asarray(of_each(p, self.placed, values)).tolist()
-            for i, value in list(zip(p.at, each, strict=True))[: 1 if p.of_robot else None]:
-                if p.what == "gravcomp":
-                    compensated = model.body_gravcomp > 0.0
-                    model.body_gravcomp[1:] = np.where(compensated.any() & ~compensated, 0.0, value)[1:]
-                elif p.what == "payload":
-                    # By name: a body that hangs on a held joint may be fused in one of both models.
+        dofs = np.array([model.joint(name).dofadr[0] for name in config.joints])
+        for p in self.placed:
+            field, at = "dof_damping" if p.what == "speed" else QUANTITIES[p.what].place, list(p.at)
+            if field.startswith("dof_"):
+                getattr(model, field)[dofs[at]] = np.asarray(getattr(world.model, field))[loop.dofs[at]]
+            elif p.what == "gravcomp":
+                compensated = model.body_gravcomp > 0.0
+                value = float(values[p.parameter.name])
+                model.body_gravcomp[1:] = np.where(compensated.any() & ~compensated, 0.0, value)[1:]
+            elif p.what == "payload":
+                # By name: a body that hangs on a held joint may be fused in one of both models.
+                for i in p.at:
                     name = self.model.body(i).name
-                    model.body_mass[model.body(name).id if name else i] += value
-                elif p.what == "speed":
-                    model.dof_damping[dofs[i]] = (drives[i].most or NO_LIMIT) / value
-                elif (field := QUANTITIES[p.what].place).startswith("dof_"):
-                    getattr(model, field)[dofs[i]] = value
-        if any(p.what in ("armature", "damping", "speed") for p in self.placed):
-            armature, damping = model.dof_armature[dofs], model.dof_damping[dofs]
-            model.dof_armature[dofs] = beside_damping(armature, damping, config.step_s)
+                    model.body_mass[model.body(name).id if name else i] += float(values[p.parameter.name])
+        if named & {"armature", "damping", "speed"}:
+            model.dof_armature[dofs] = np.asarray(world.model.dof_armature)[loop.dofs]
         copy_back(spec, model)
         return spec.to_xml()
 
     def plain_simulation(self, values: Mapping[str, float]) -> PlainSimulation:
-        """Return the driven model with identified values."""
         if "payload" in self.config.commands:
             raise UsageError(
                 "a model card reproduces logs without a payload, and these name one",
@@ -306,31 +301,14 @@ class MjcfRobot(LoggedRobot):
         loop, world, how = self.identifiable(1.0), self.make_nodes()[2], self.config.how(*self._how)
         return driven_simulation(lambda start: loop.params(values, start)[world.name], world, how)
 
-    def _drives(self, values: Mapping[str, Scalar]) -> list[JointDrive]:
-        """Return the joints' drives with identified values."""
-        commands = self.config.commands
-        control = "position" if "goal" in commands else "velocity" if "goal_velocity" in commands else "torque"
-        usual: dict[str, float] = {
-            "stiffness": QUANTITIES["kp"].nominal,
-            "damping": 0.0,
-            "gain": QUANTITIES["gain"].nominal,
-        }
-        drives = [{**usual, "most": most} for most in self._limits]
-        names = {"kp": "stiffness", "kd": "damping", "gain": "gain", "torque": "most"}
-        for p in self.placed:
-            each = np.asarray(of_each(p, self.placed, values)).tolist() if p.what in names else ()
-            for i, value in zip(p.at, each, strict=bool(each)):
-                of_file = drives[i]["most"] or NO_LIMIT
-                if p.what == "torque":
-                    value = min(value, of_file) if p.among_limits else value
-                drives[i][names[p.what]] = None if p.what == "torque" and value >= NO_LIMIT else value
-        return [JointDrive(control, **drive) for drive in drives]
-
 
 class IdentifiableMjcf(IdentifiableRecording):
     """Simulates what the encoders measured; an ``identification.model.IdentifiableModel``.
 
     Encoders are read a tick later than recorded, and interpolate a tick back: nothing shifts.
+
+    Attributes:
+        joints, dofs: Numbers of the joints in the model, and of their degrees of freedom.
 
     Args:
         max_delay_s: Upper bound of the delay [s].
@@ -342,16 +320,15 @@ class IdentifiableMjcf(IdentifiableRecording):
         self.ahead_s = robot.tick_s
         self._world = world = robot.make_nodes()[2]
         self._placed: Sequence[ParameterAt] = robot.placed
-        self._joints, self._dofs = world.joints, world.qvel_at
+        self.joints, self.dofs = world.joints, world.qvel_at
         self._params = {**self._params, world.name: robot.base(self._params[world.name])}
         self._model = robot.model
 
     def reached(self, recordings: Sequence[Episode]) -> Mapping[str, float]:
-        """Return limit -> the largest torque or speed that recordings reach, of limits that no pattern names."""
         limits = [p for p in self._placed if p.among_limits]
         if not limits:
             return {}
-        pairs = [_reached(self._model, self._joints, episode) for episode in recordings]
+        pairs = [_reached(self._model, self.joints, episode) for episode in recordings]
         most: dict[str, np.ndarray] = dict(zip(LIMITS, np.max(pairs, axis=0), strict=True))
         return {p.parameter.name: float(most[p.what][list(p.at)].max()) for p in limits}
 
@@ -367,8 +344,8 @@ class IdentifiableMjcf(IdentifiableRecording):
             start: Shape ``(2 * joints,)``: positions as measured, then velocities.
         """
         tree = self.parameters.placed(self._params, values)
-        world = place(self._placed, values, tree["world"], self._joints, self._dofs)
-        n = len(self._dofs)
+        world = place(self._placed, values, tree["world"], self.joints, self.dofs)
+        n = len(self.dofs)
         angle = start[:n] - world.zero
         speed = start[n:]
         if world.terms is not None:

@@ -24,8 +24,7 @@ from sim2real.identification.parameters import Parameter
 from sim2real.later import jnp
 from sim2real.robots.messages import EpisodeStart
 from sim2real.robots.robot import RobotModel
-from sim2real.robots.servo.datasheet import DataSheet
-from sim2real.robots.servo.servos import Servos, name_of
+from sim2real.robots.servo.servos import DataSheet, Servos, name_of
 from sim2real.robots.session import Embedded
 from sim2real.types import MjModel, MjSpec, PyTree, Scalar
 
@@ -131,7 +130,6 @@ class ServoModel(RobotModel):
         return ServoParams(self.fields(values), qpos, qvel, self._stribeck(values))
 
     def true_state(self, state: ServoState) -> PyTree:
-        """Return positions and velocities of all joints, and the servos' setpoints."""
         return state.data.qpos, state.data.qvel, state.reference
 
     def fields(self, values: Mapping[str, Scalar]) -> dict[str, PyTree]:
@@ -188,7 +186,6 @@ class ServoModel(RobotModel):
         return PlainSimulation(mjcf, s.names, self.tick_s, begin, "setpoint", numbers, **lead)
 
     def following(self, values: Mapping[str, float]) -> Following:
-        """Return how the joints follow their goals, with every payload that the hand can bear."""
         hand = self.hand
         loads = [{}] if hand is None else [{PAYLOAD: hand.least_kg}, {PAYLOAD: hand.most_kg}]
         return identified_following([self.identified_mjcf({**values, **load}) for load in loads], self.servos.names)

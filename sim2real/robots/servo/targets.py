@@ -12,9 +12,8 @@ import numpy as np
 from sim2real.arrays import namespace
 from sim2real.later import jax, jnp
 from sim2real.robots.messages import JointReading
-from sim2real.robots.servo.observation import Feature, ServoAgent
 from sim2real.robots.servo.servos import Servos
-from sim2real.robots.servo.task import Aim, AimTask, ServoMoment, uniform
+from sim2real.robots.servo.task import Aim, AimTask, Feature, ServoAgent, ServoMoment, uniform
 from sim2real.types import Array, Key, Scalar
 
 FIGURE_HZ, FIGURE_M = 0.7, (0.05, 0.025)

@@ -116,7 +116,6 @@ class ServoWorld(BaseWorld):
         self._mjx_model = self._mjx_model.replace(opt=option)
 
     def init_params(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> ServoParams:
-        """Return the model as it was compiled, at rest."""
         return ServoParams({}, jnp.asarray(self.model.qpos0, jnp.float32), jnp.zeros(self.model.nv))
 
     def init_state(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> ServoState:

@@ -1,4 +1,4 @@
-"""Sensor and drive of a walking robot."""
+"""Messages, sensor and drive of a walking robot."""
 
 from __future__ import annotations
 
@@ -11,18 +11,96 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from sim2real import pytree
+from sim2real.arrays import namespace
 from sim2real.artifacts.identification import Noise
 from sim2real.errors import SafetyStop, UsageError
+from sim2real.graph.base import Base
 from sim2real.identification.model import Channel
 from sim2real.robots.robot import RobotDrive, RobotSensor
-from sim2real.robots.servo.drive import approached
+from sim2real.robots.servo.servos import approached
 from sim2real.robots.session import Embedded, Session
-from sim2real.robots.walking.messages import BodyReading, LegCommand, gravity_of, leg_command
+from sim2real.types import Array
 
 if TYPE_CHECKING:
     from sim2real.hardware.device import Device, Reading
     from sim2real.hardware.safety.gate import GateConfig
     from sim2real.hardware.safety.limits import GateLimits
+
+
+@pytree.dataclass
+class BodyReading(Base):
+    """A measurement of encoders and IMU.
+
+    Attributes:
+        position: Shape ``(joints,)`` [rad].
+        velocity: Shape ``(joints,)`` [rad/s].
+        quaternion: Shape ``(4,)``: orientation of the base in the world, w first.
+        gyro: Shape ``(3,)``: angular velocity in the axes of the base [rad/s].
+    """
+
+    position: Array
+    velocity: Array
+    quaternion: Array
+    gyro: Array
+
+
+@pytree.dataclass
+class WalkDecision(Base):
+    """The agent's message.
+
+    Attributes:
+        q: Shape ``(joints,)``: targets of the joints [rad].
+        aim: Shape ``(3,)``: the commanded velocity: forwards, to the left [m/s], yaw rate [rad/s].
+    """
+
+    q: Array
+    aim: Array
+
+
+@pytree.dataclass
+class LegCommand(Base):
+    """The command of the motors, each ``(joints,)``: its torque is ``tau + kp (q - position) + kd (dq - velocity)``.
+
+    Attributes:
+        q: Targets [rad].
+        dq: Velocities [rad/s].
+        kp: Gains of the position [N m/rad].
+        kd: Gains of the velocity [N m s/rad].
+        tau: Torques [N m].
+    """
+
+    q: Array
+    dq: Array
+    kp: Array
+    kd: Array
+    tau: Array
+
+
+def leg_command(q: Array, kp: float, kd: float) -> LegCommand:
+    """Return the command of targets ``(joints,)`` with the same gains for all motors."""
+    xp = namespace(q)
+    zero = xp.zeros_like(q)
+    return LegCommand(q, zero, zero + kp, zero + kd, zero)
+
+
+def into_base(quaternion: Array, vector: Any) -> Array:
+    """Return a vector of the world ``(3,)`` in the axes of the base.
+
+    Args:
+        quaternion: Shape ``(4,)``, w first; its length is taken out, as the mean of two orientations is shorter than 1.
+    """
+    xp = namespace(quaternion, vector)
+    unit = quaternion / xp.sqrt(xp.sum(quaternion**2))
+    w, u = unit[0], -unit[1:]
+    vector = xp.asarray(vector, dtype=unit.dtype)
+    return vector + 2.0 * xp.cross(u, xp.cross(u, vector) + w * vector)
+
+
+def gravity_of(quaternion: Array) -> Array:
+    """Return the direction of gravity in the axes of the base, shape ``(3,)``; ``(0, 0, -1)`` while it is level."""
+    return into_base(quaternion, (0.0, 0.0, -1.0))
+
 
 Place = Literal["floor", "stand"]
 _STILL_RAD_S = 0.3
@@ -101,7 +179,6 @@ class BodySensor(RobotSensor):
         )
 
     def read(self, reading: Reading) -> BodyReading:
-        """Return the message of a reading."""
         parts = reading.parts
         return BodyReading(reading.position_rad, reading.velocity_rad_s, parts["quaternion"], parts["gyro"])
 
@@ -135,7 +212,6 @@ class WalkingDrive(RobotDrive):
 
     @property
     def embedded(self) -> Embedded | None:
-        """The emulated robot on the floor, for the port ``embedded``."""
         return self._emulated("floor")
 
     def _emulated(self, place: Place) -> Embedded | None:
@@ -159,22 +235,18 @@ class WalkingDrive(RobotDrive):
         return Session(port, device, self._gate(limits, device(port)), self._emulated(place), truth_path, seed)
 
     def prepare(self, session: Session, settle_s: float) -> None:
-        """Wait, with torque off, until the robot lies still."""
         session.rig.wait_until_still(settle_s, _STILL_RAD_S)
 
     def around(self, signal: np.ndarray) -> np.ndarray:
-        """Return targets ``(N, joints)`` [rad] of an excitation around the stance."""
         return signal + self._stance
 
     def standing(self, duration_s: float) -> np.ndarray:
-        """Return targets ``(N, joints)`` around the stance [rad]: the legs bend towards folded ones, and back."""
         t_s = np.arange(0.0, duration_s, 1.0 / self.rate_hz)
         bent = 0.5 * _BENT * (1.0 - np.cos(2.0 * np.pi * _BEND_HZ * t_s))
         folded = self._stance if self._motors is None else np.asarray(self._motors.folded)
         return bent[:, None] * (folded - self._stance)
 
     def approach(self, session: Session, commands: np.ndarray) -> np.ndarray:
-        """Return targets ``(N, joints)`` [rad]: joints move to the first at 1 rad/s, from legs that hang at rest."""
         hanging = session.rig.wait_until_still(_HANG_S, _STILL_RAD_S)
         return approached(commands, hanging.position_rad, self.rate_hz)
 

@@ -14,16 +14,11 @@ import numpy as np
 
 from sim2real.robots.loop import DELAYS
 from sim2real.robots.robot import Robot, RobotDrive
-from sim2real.robots.walking.agent import WalkingAgent
-from sim2real.robots.walking.commands import Commands
+from sim2real.robots.walking.body import Terrain
 from sim2real.robots.walking.drive import BodySensor, LegMotors, WalkingDrive
-from sim2real.robots.walking.joints import JointParameters
-from sim2real.robots.walking.model import STRENGTH, WalkingModel
-from sim2real.robots.walking.moment import Moment
-from sim2real.robots.walking.scene import Ground
 from sim2real.robots.walking.stand import LegsInAStand
-from sim2real.robots.walking.task import Term, WalkingTask
-from sim2real.robots.walking.terrain import Terrain
+from sim2real.robots.walking.task import Commands, Moment, Term, WalkingAgent, WalkingTask
+from sim2real.robots.walking.world import STRENGTH, Ground, JointParameters, WalkingModel
 
 
 class ComposedRobot(Robot):
@@ -97,11 +92,9 @@ class ComposedRobot(Robot):
         return kind().called_like(self)
 
     def nominal(self) -> dict[str, float]:
-        """Return the nominal values of the model's parameters, and the delays."""
         return super().nominal() | dict(zip(DELAYS, self.delays_s, strict=True))
 
     def identifiable(self, max_delay_s: float) -> LegsInAStand:
-        """Return the model to identify: the robot in a stand, as ``record`` expects it."""
         # The strengths of the motors take the place of a factor on all of them.
         fixed = [replace(p, free=False) for p in self.model.around() if p.name == STRENGTH]
         loop = self.sensor.channels, self.rate_hz, self.gains[1]

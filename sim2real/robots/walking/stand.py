@@ -19,8 +19,8 @@ from sim2real.identification.parameters import Parameter, ParameterTable
 from sim2real.robots.loop import ACTUATOR, SENSOR, WORLD, DelayParams, delay_of, delay_parameters, recorded_loop
 from sim2real.robots.model.drives import EncoderParams, Encoders, driven_spec
 from sim2real.robots.model.file import read_spec
-from sim2real.robots.walking.joints import STRENGTH, JointParameters
-from sim2real.robots.walking.messages import gravity_of
+from sim2real.robots.walking.drive import gravity_of
+from sim2real.robots.walking.world import MOTOR_STRENGTH, JointParameters
 from sim2real.types import Array, Key, MjModel, PyTree, Scalar
 from sim2real.worlds.driven import DriveCommand, DrivenWorld
 from sim2real.worlds.mjx import MjxState
@@ -104,7 +104,7 @@ class LegsInAStand:
             for field, quantity in places.items()
         }
         # A motor's strength is a factor on its whole law.
-        strength, zero = (joints.of_motor(values, name, jnp) for name in (STRENGTH, "zero"))
+        strength, zero = (joints.of_motor(values, name, jnp) for name in (MOTOR_STRENGTH, "zero"))
         damping = fields["dof_damping"].at[dofs].add(self._kd * strength)
         fields["dof_armature"] -= 0.5 * (STEP_S - FINE_S) * damping
         still, state = jnp.zeros(count), jnp.asarray(start)

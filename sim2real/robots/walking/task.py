@@ -1,21 +1,150 @@
-"""The task of a walking robot: follow commanded velocities."""
+"""The task of a walking robot: commanded velocities, what a reward sees, and the policy's node."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import NamedTuple, Unpack
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sim2real.graph.base import GraphState
+from sim2real.arrays import namespace
+from sim2real.errors import UsageError
+from sim2real.graph.base import GraphState, StepState
+from sim2real.graph.node import NodeOptions
+from sim2real.policy.contract import ActionTerm, ObservationTerm
+from sim2real.robots.agent import AgentParams, PolicyAgent
 from sim2real.robots.loop import AGENT, WORLD, Draw
 from sim2real.robots.messages import EpisodeStart
-from sim2real.robots.robot import RobotTask
-from sim2real.robots.walking.commands import Commands
-from sim2real.robots.walking.messages import gravity_of, into_base
-from sim2real.robots.walking.moment import Moment
-from sim2real.types import Array, Key
+from sim2real.robots.robot import RobotAgent, RobotTask
+from sim2real.robots.walking.drive import BodyReading, WalkDecision, gravity_of, into_base
+from sim2real.types import Array, Key, PyTree, Scalar
+
+
+@dataclass(frozen=True)
+class Commands:
+    """Commands that are drawn for an episode, one after the other; after the last one the first follows.
+
+    Attributes:
+        most: Largest magnitudes: forwards, to the left [m/s], yaw rate [rad/s].
+        every_s: How long a command lasts [s].
+        stand: Share of the commands that are 0: the robot stands still.
+        count: Number of commands that are drawn.
+        fixed: The command of all trials; None: each trial has its own.
+    """
+
+    most: tuple[float, float, float] = (1.0, 0.6, 0.8)
+    every_s: float = 2.5
+    stand: float = 0.1
+    count: int = 4
+    fixed: tuple[float, float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if min(self.most) < 0 or self.every_s <= 0 or not 0 <= self.stand <= 1 or self.count < 1:
+            raise UsageError(f"commands need sizes of at least 0, a time above 0 and a share in [0, 1], got {self}")
+        if self.fixed is not None and not np.all(np.abs(self.fixed) <= self.most):
+            most = ", ".join(f"{value:g}" for value in self.most)
+            raise UsageError(f"the policy follows velocities of at most {most}, got {self.fixed}")
+
+    @property
+    def size(self) -> int:
+        """Number of entries of an episode's aim."""
+        return 3 * self.count
+
+    def draw(self, key: Key) -> Array:
+        """Return the commands of an episode, shape ``(3 * count,)``."""
+        k_size, k_stand = jax.random.split(key)
+        drawn = jax.random.uniform(k_size, (self.count, 3), minval=-1.0, maxval=1.0) * jnp.array(self.most)
+        return (drawn * (jax.random.uniform(k_stand, (self.count, 1)) >= self.stand)).ravel()
+
+    def of_trial(self, trial: int) -> np.ndarray:
+        """Return the commands of a trial, none of them to stand still.
+
+        The same number gives the same commands, on hardware and in simulation.
+        """
+        if self.fixed is not None:
+            return np.tile(np.array(self.fixed, np.float32), self.count)
+        return np.asarray(replace(self, stand=0.0).draw(jax.random.key(trial)), np.float32)
+
+    def at(self, drawn: Array, t_s: Scalar) -> Array:
+        """Return the command ``(3,)`` at a time of an episode [s]."""
+        xp = namespace(drawn, t_s)
+        row = xp.asarray(t_s / self.every_s + 1e-4, dtype=np.int32) % self.count
+        return xp.asarray(drawn).reshape(-1, 3)[row]
+
+
+class Moment(NamedTuple):
+    """A policy step of a walking robot, from the true state after it. Vectors of the base are in its axes.
+
+    Attributes:
+        command: Shape ``(3,)``: forwards, to the left [m/s], yaw rate [rad/s].
+        linear: Shape ``(3,)``: velocity of the base [m/s].
+        angular: Shape ``(3,)``: angular velocity of the base [rad/s].
+        gravity: Shape ``(3,)``: direction of gravity.
+        mean: Shape ``(3,)``: forward, left and yaw velocity, smoothed over 0.4 s.
+        height: Height of the base above its lowest foot [m].
+        offset: Shape ``(joints,)``: position less stance [rad].
+        torque: Shape ``(joints,)`` [N m].
+        last: Shape ``(joints,)``: this step's action.
+        before: Shape ``(joints,)``: the action before it.
+        touches: Shape ``(feet,)``, bool.
+        lands: Shape ``(feet,)``, bool: the foot landed in this step.
+        swing_s: Shape ``(feet,)``: time in the air of the last swing [s].
+        slip_m_s: Shape ``(feet,)``: speed of the foot along the ground while it touches [m/s].
+        falls: Whether the episode ends with this step, bool.
+    """
+
+    command: jax.Array
+    linear: jax.Array
+    angular: jax.Array
+    gravity: jax.Array
+    mean: jax.Array
+    height: jax.Array
+    offset: jax.Array
+    torque: jax.Array
+    last: jax.Array
+    before: jax.Array
+    touches: jax.Array
+    lands: jax.Array
+    swing_s: jax.Array
+    slip_m_s: jax.Array
+    falls: jax.Array
+
+    @property
+    def moving(self) -> jax.Array:
+        """1 if a velocity is commanded, 0 if the robot has to stand still."""
+        return (jnp.sum(self.command**2) > 0.01).astype(jnp.float32)
+
+    # -- measures that terms weigh
+
+    def tracks(self, width: float = 0.25) -> jax.Array:
+        """Return 1 at the commanded velocity, less beside it; ``width``: squared error of 1/e [m^2/s^2]."""
+        return jnp.exp(-jnp.sum((self.command[:2] - self.linear[:2]) ** 2) / width)
+
+    def turns(self, width: float = 0.25) -> jax.Array:
+        """Return 1 at the commanded yaw rate, less beside it."""
+        return jnp.exp(-((self.command[2] - self.angular[2]) ** 2) / width)
+
+    def action_rate(self) -> jax.Array:
+        """Return the squared change from the last action."""
+        return jnp.sum((self.last - self.before) ** 2)
+
+    def steps(self, least_s: float = 0.1, most_s: float = 0.5) -> jax.Array:
+        """Return how long the feet that landed were in the air, beyond ``least_s``; 0 while standing still [s]."""
+        credit = jnp.clip(self.swing_s, 0.0, most_s) - least_s
+        return self.moving * jnp.sum(jnp.where(self.lands, credit, 0.0))
+
+    def slip(self) -> jax.Array:
+        """Return the squared speed of feet along the ground."""
+        return jnp.sum(jnp.clip(self.slip_m_s, 0.0, 2.0) ** 2)
+
+    def lifted_at_rest(self) -> jax.Array:
+        """Return the number of feet in the air while the robot has to stand still."""
+        return (1.0 - self.moving) * jnp.sum(~self.touches)
+
 
 _GAIT_S = 0.4
 """A step of the gait, over which a velocity is averaged [s]."""
@@ -45,21 +174,17 @@ class WalkingTask(RobotTask):
         self._terms, self._falls, self._close = terms, falls, close
 
     def random(self, key: Key, draw: Draw) -> tuple[dict, EpisodeStart]:
-        """Return parameters, and a start in the stance with random commands."""
         k_values, k_commands = jax.random.split(key)
         stance = jnp.asarray(self._stance)
         return draw(k_values), EpisodeStart(stance, jnp.zeros_like(stance), self._commands.draw(k_commands))
 
     def at_rest(self, trial: int) -> EpisodeStart:
-        """Return the start in the stance with the commands of a trial."""
         return EpisodeStart(self._stance, np.zeros_like(self._stance), self._commands.of_trial(trial))
 
     def narrowed(self, start: EpisodeStart, share: Array) -> EpisodeStart:
-        """Return a start whose commanded velocities are smaller by a share."""
         return start.replace(aim=share * start.aim)
 
     def judged(self, graph_state: GraphState) -> Moment:
-        """Return the moment after a step, from the true state."""
         world, agent = graph_state.state[WORLD], graph_state.state[AGENT]
         data, v = world.data, world.variables
         t_s = (graph_state.step - 1) * self._period_s
@@ -84,16 +209,13 @@ class WalkingTask(RobotTask):
         return moment._replace(falls=self._falls(moment))
 
     def reward(self, state: Moment, action: jax.Array) -> dict[str, jax.Array]:
-        """Return the terms."""
         del action
         return {name: jnp.float32(weight * measure(state)) for name, (weight, measure) in self._terms.items()}
 
     def success(self, state: Moment) -> jax.Array:
-        """Return whether the mean velocity is near the commanded one."""
         return jnp.all(jnp.abs(state.mean - state.command) < self._close)
 
     def terminated(self, state: Moment) -> jax.Array:
-        """Return whether the robot has fallen."""
         return state.falls
 
     def score(self, t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float]:
@@ -119,3 +241,86 @@ class WalkingTask(RobotTask):
             "velocity_error_m_s": float(np.hypot(off[0], off[1]).mean()),
             "yaw_error_rad_s": float(np.abs(off[2]).mean()),
         }
+
+
+class WalkingNode(PolicyAgent):
+    """Sends joint targets around the stance.
+
+    Its features are gyro, gravity, joints beside the stance, and the last action. The history has features alone.
+
+    Args:
+        stance: Shape ``(joints,)``: targets of the action 0 [rad].
+        scale: Change of a target by the action 1 [rad].
+        history: Number of earlier observations that the policy gets.
+    """
+
+    def __init__(
+        self,
+        rate: float,
+        stance: np.ndarray,
+        scale: float,
+        history: int,
+        commands: Commands,
+        **options: Unpack[NodeOptions],
+    ) -> None:
+        super().__init__(AGENT, rate, len(stance), history, (6 + 3 * len(stance),), **options)
+        self._stance, self._scale, self._commands = np.asarray(stance, np.float32), np.float32(scale), commands
+
+    def init_params(self, rng: Key | None = None, graph_state: GraphState | None = None) -> AgentParams:
+        return AgentParams(aim=np.zeros(self._commands.size, np.float32), start=self._stance)
+
+    def commanded(self, step_state: StepState) -> Array:
+        """Return the commanded velocity ``(3,)`` of a step: forwards, to the left [m/s], yaw rate [rad/s]."""
+        return self._commands.at(step_state.params.aim, step_state.seq / self.rate)
+
+    def features(self, reading: BodyReading, step_state: StepState) -> Array:
+        last = step_state.state.last
+        parts = [reading.gyro, gravity_of(reading.quaternion), reading.position - self._stance, reading.velocity, last]
+        return namespace(reading.position, last).concatenate(parts).astype(np.float32)
+
+    def shown(self, features: Array, step_state: StepState) -> Array:
+        return namespace(features).concatenate([features, self.commanded(step_state)])
+
+    def command(self, before: Array, action: Array) -> Array:
+        return self._stance + self._scale * action
+
+    def message(self, command: Array, step_state: StepState) -> WalkDecision:
+        commanded = self.commanded(step_state)
+        return WalkDecision(command, namespace(commanded).asarray(commanded, np.float32))
+
+    def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> WalkDecision:
+        start = self._params(graph_state).start
+        return WalkDecision(namespace(start).asarray(start, np.float32), np.zeros(3, np.float32))
+
+
+class WalkingAgent(RobotAgent):
+    """Observation and action of a walking robot: gyro, gravity, joints, last actions, and the commanded velocity."""
+
+    units = MappingProxyType({"aim": "m/s, m/s, rad/s"})
+
+    def __init__(
+        self, joints: Sequence[str], stance: np.ndarray, scale: float, history: int, commands: Commands
+    ) -> None:
+        n = len(joints)
+        self._stance, self._scale, self._history, self._commands = stance, scale, history, commands
+        units = ("rad/s",) * 3 + ("1",) * 3 + ("rad",) * n + ("rad/s",) * n + ("1",) * n
+        now = (
+            ObservationTerm("gyro", units[:3]),
+            ObservationTerm("gravity in the base's axes", units[3:6]),
+            ObservationTerm("joint position less stance", units[6 : 6 + n]),
+            ObservationTerm("joint velocity", units[6 + n : 6 + 2 * n]),
+            ObservationTerm("last action", units[6 + 2 * n :]),
+            ObservationTerm("command: forwards, left, yaw rate", ("m/s", "m/s", "rad/s")),
+        )
+        past = (ObservationTerm("earlier features, newest first", units, history),) if history else ()
+        self.observation = (*now, *past)
+        self.action = tuple(ActionTerm(name, "1", -1.0, 1.0) for name in joints)
+
+    def make(self, rate_hz: float, **options: Unpack[NodeOptions]) -> WalkingNode:
+        return WalkingNode(rate_hz, self._stance, self._scale, self._history, self._commands, **options)
+
+    def params(self, start: EpisodeStart, policy: PyTree) -> AgentParams:
+        return AgentParams(policy, start.aim, np.asarray(self._stance, np.float32))
+
+    def tilt_rad(self, observation: np.ndarray) -> float:
+        return float(np.arccos(np.clip(-observation[5], -1.0, 1.0)))

@@ -17,10 +17,9 @@ from sim2real.robots.nodes import in_numpy
 from sim2real.robots.robot import Robot
 from sim2real.robots.walking.body import HiddenTwin as HiddenTwin
 from sim2real.robots.walking.body import LeggedBody
-from sim2real.robots.walking.joints import STRENGTH as MOTOR_STRENGTH
-from sim2real.robots.walking.messages import BodyReading, gravity_of, into_base
-from sim2real.robots.walking.model import FRICTION, PAYLOAD, STRENGTH
+from sim2real.robots.walking.drive import BodyReading, gravity_of, into_base
 from sim2real.robots.walking.robot import ComposedRobot
+from sim2real.robots.walking.world import FRICTION, MOTOR_STRENGTH, PAYLOAD, STRENGTH
 
 _mj: Any = mujoco
 STEP_S = 0.002

@@ -20,10 +20,9 @@ from sim2real.artifacts.posterior import Posterior, from_scale
 from sim2real.errors import OtherMotion, UsageError
 from sim2real.graph.episode import Episode
 from sim2real.robots.loop import ACTUATOR, DELAYS, SENSOR
-from sim2real.robots.walking.joints import STRENGTH
-from sim2real.robots.walking.messages import gravity_of
+from sim2real.robots.walking.drive import gravity_of
 from sim2real.robots.walking.robot import ComposedRobot
-from sim2real.robots.walking.world import PAYLOAD
+from sim2real.robots.walking.world import MOTOR_STRENGTH, PAYLOAD
 from sim2real.types import MjData, MjModel
 
 _mj: Any = mujoco
@@ -62,7 +61,7 @@ class Balances:
         """Return the load with which a part of the balances agrees best [kg]."""
         joints = robot.model.joints
         damping, friction = (joints.of_group(values, name) for name in ("damping", "friction"))
-        torque = joints.of_motor(values, STRENGTH) * self.law - damping * self.speed - friction * self.direction
+        torque = joints.of_motor(values, MOTOR_STRENGTH) * self.law - damping * self.speed - friction * self.direction
         return float((self.rest - (self.share * torque).sum(axis=1))[part].sum() / self.size[part].sum())
 
 

@@ -1,8 +1,11 @@
-"""The world of a walking robot: a composed task whose message is what encoders and IMU measure."""
+"""A walking robot in simulation: its task on the ground, its world, and its parameters."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import jax
@@ -10,20 +13,165 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from sim2real import composer
+from sim2real.composer import mjcf
 from sim2real.composer.physics.mjx import stepping
+from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState
+from sim2real.identification.parameters import Parameter
 from sim2real.robots.loop import ACTUATOR, WORLD
-from sim2real.robots.walking.messages import BodyReading
-from sim2real.robots.walking.scene import Ground
+from sim2real.robots.messages import EpisodeStart
+from sim2real.robots.robot import RobotModel
+from sim2real.robots.walking.body import FLOOR, HeightField, Terrain
+from sim2real.robots.walking.drive import BodyReading
+from sim2real.types import Array, PyTree, Scalar
 from sim2real.worlds.composed import ComposedWorld, WorldParams
 
 if TYPE_CHECKING:
     from sim2real.composer.mjx_environment import State
     from sim2real.composer.physics.mjx.physics import MjxPhysics
 
+FRICTION, STRENGTH, ROUGHNESS = "foot_friction", "motor_strength", "roughness"
+PAYLOAD, ARMATURE, MOTOR_STRENGTH = "payload", "armature", "strength"
+QUANTITIES = {
+    "damping": ("N m s/rad", 0.1, 0.002, 2.0, "viscous friction of a joint"),
+    "friction": ("N m", 0.2, 0.005, 2.0, "dry friction of a joint"),
+    "armature": ("kg m^2", 0.01, 0.0005, 0.1, "rotor behind the gears"),
+}
+"""Quantity of a group of joints -> unit, nominal value, bounds, description."""
+ZERO_RAD = 0.015
+"""Deviation of the prior of an encoder's zero [rad]."""
+
+
+@dataclass(frozen=True)
+class JointParameters:
+    """Names of the parameters of joints, and their places.
+
+    Attributes:
+        motors: Names of the joints, in the order of the motors.
+        groups: Name of a group -> numbers of its joints, which have one damping, friction and armature.
+    """
+
+    motors: tuple[str, ...]
+    groups: Mapping[str, Sequence[int]]
+
+    def dynamics(self) -> list[Parameter]:
+        """Return damping, friction and armature of each group, and the strength of each motor."""
+        rows = [
+            Parameter(f"{group}_{name}", unit, nominal, low, high, about=about, vanishes=name != "armature")
+            for group in self.groups
+            for name, (unit, nominal, low, high, about) in QUANTITIES.items()
+        ]
+        about = "factor on the motor's torque"
+        return rows + [Parameter(f"{m}_{MOTOR_STRENGTH}", "1", 1.0, 0.4, 2.0, about=about) for m in self.motors]
+
+    def zeros(self) -> list[Parameter]:
+        """Return the encoders' zeros; legs in the air weigh little, so their zeros change a log little."""
+        import distrax
+
+        prior, about = distrax.Normal(0.0, ZERO_RAD), "encoder at the model's zero"
+        return [
+            Parameter(f"{m}_zero", "rad", 0.0, -0.1, 0.1, "linear", "measurement", about, prior=prior)
+            for m in self.motors
+        ]
+
+    def of_group(self, values: Mapping[str, Scalar], quantity: str, xp: PyTree = np) -> Array:
+        """Return a quantity of all joints, ``(joints,)``."""
+        each = {i: values[f"{group}_{quantity}"] for group, at in self.groups.items() for i in at}
+        return xp.stack([xp.asarray(each[i], dtype=float) for i in range(len(self.motors))])
+
+    def of_motor(self, values: Mapping[str, Scalar], quantity: str, xp: PyTree = np) -> Array:
+        """Return a quantity that each motor has of its own, ``(joints,)``."""
+        return xp.stack([xp.asarray(values[f"{motor}_{quantity}"], dtype=float) for motor in self.motors])
+
+
+_SMOOTHED_S = 0.4
+"""Time constant of the mean velocity that success is judged by: a gait sways within a step [s]."""
+
+
+class Ground(composer.Task):
+    """A robot of an MJCF file on its floor; one control step is one step of the physics.
+
+    Args:
+        path: MJCF with a body that has the only free joint, and an actuator for each other joint.
+        feet: Sites in the middle of the feet's spheres.
+        touching_m: Height of such a site below which the foot touches the ground [m].
+        collide: Geoms that the floor sees in training; empty: all.
+        rough: Heights of the ground in place of the model's floor; None: it is flat.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        feet: Sequence[str],
+        touching_m: float,
+        collide: Sequence[str] = (),
+        rough: HeightField | None = None,
+    ) -> None:
+        model = mjcf.from_path(str(path))
+        self._entity = composer.ModelWrapperEntity(model)
+        free = [j for j in model.find_all("joint") if j.tag == "freejoint" or j.type == "free"]
+        if len(free) != 1:
+            raise UsageError(f"{path} has {len(free)} free joints, and a walking robot has one")
+        self.base = free[0].parent
+        self.feet = [model.find("site", name) for name in feet]
+        self.actuators = model.find_all("actuator")
+        self.joints = [actuator.joint for actuator in self.actuators]
+        self.foot_geoms = [model.find("geom", name) for name in feet]
+        self._touching_m, self.rough = touching_m, rough
+        if rough is not None:
+            floor = model.find("geom", FLOOR)
+            if floor is None:
+                raise UsageError(f"{path} has no geom {FLOOR!r}, which rough ground replaces")
+            # MJCF lists the rows of heights from the last one to the first.
+            (rows, columns), share = rough.heights.shape, rough.heights[::-1] / rough.heights.max()
+            floor.type, floor.hfield = (
+                "hfield",
+                model.asset.add(
+                    "hfield", name="ground", nrow=rows, ncol=columns, size=rough.size, elevation=share.ravel()
+                ),
+            )
+        if collide:
+            for geom in model.find_all("geom"):
+                if geom.name != FLOOR:
+                    geom.contype, geom.conaffinity = 0, int(geom.name in collide)
+        self._entity.observables.disable_all()
+
+    @property
+    def root_entity(self) -> Any:
+        return self._entity
+
+    def initialize_episode(self, physics: Any, random_state: Any) -> None:
+        del random_state
+        xp, count = physics.np, len(self.feet)
+        for name in ("air_s", "ground_s", "swing_s", "slip_m_s"):
+            physics.variables[name] = xp.zeros(count)
+        physics.variables["at_m"] = xp.zeros((count, 3))
+        physics.variables["mean"] = xp.zeros(3)
+
+    def after_step(self, physics: Any, random_state: Any) -> None:
+        del random_state
+        v, xp, tick_s = physics.variables, physics.np, self.physics_timestep
+        at = physics.bind(self.feet).xpos
+        height = at[:, 2] if self.rough is None else at[:, 2] - self.rough.at(at[:, :2])
+        touches, moved = height < self._touching_m, xp.sqrt(xp.sum((at - v["at_m"])[:, :2] ** 2, axis=-1)) / tick_s
+        lands = touches & (v["air_s"] > 0)
+        v["swing_s"] = xp.where(lands, v["air_s"], v["swing_s"])
+        v["slip_m_s"] = xp.where(touches & (v["ground_s"] > 0), moved, 0.0)
+        v["air_s"] = xp.where(touches, 0.0, v["air_s"] + tick_s)
+        v["ground_s"] = xp.where(touches, v["ground_s"] + tick_s, 0.0)
+        v["at_m"] = at
+        turn, speed = physics.bind(self.base).xmat.reshape(3, 3), physics.data.qvel
+        now = xp.concatenate([(turn.T @ speed[:3])[:2], speed[5:6]])
+        v["mean"] = v["mean"] + (tick_s / _SMOOTHED_S) * (now - v["mean"])
+
+    def get_reward(self, physics: Any) -> float:
+        del physics
+        return 0.0
+
+
 mj: Any = mujoco
 
-PAYLOAD, ARMATURE = "payload", "armature"
 _ROWS = 9
 """Loads that the table of models has; between them the constants are interpolated."""
 _LOADED = ("body_mass", "body_ipos", "body_inertia", "body_subtreemass", "body_invweight0", "dof_invweight0")
@@ -59,7 +207,6 @@ class WalkingWorld(ComposedWorld):
         self._qvel = jnp.array([int(j.dofadr[0]) for j in actuated])
 
     def init_params(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> WorldParams:
-        """Return the parameters' compiled values, and no load."""
         params = super().init_params(rng, graph_state)
         if self._table is None:  # while it is made
             return params
@@ -80,7 +227,6 @@ class WalkingWorld(ComposedWorld):
             physics.replace("model", name, table[low] + (place - low) * (table[low + 1] - table[low]))
 
     def output(self, state: State) -> BodyReading:
-        """Return what encoders and IMU measure."""
         data = state.data
         return BodyReading(data.qpos[self._qpos], data.qvel[self._qvel], data.qpos[3:7], data.qvel[3:6])
 
@@ -101,3 +247,115 @@ def load_base(model: Any, base: int, load_kg: float) -> Any:
     loaded.body_ipos[base] = model.body_ipos[base] * before / (before + load_kg)
     mj.mj_setConst(loaded, mj.MjData(loaded))
     return loaded
+
+
+class WalkingModel(RobotModel):
+    """A composed task on MJX: on Warp if JAX computes on a GPU, as MJX's JAX is 20 times slower with contacts there.
+
+    Args:
+        joints: Parameters of the joints, in the order of the actuators.
+        height_m: Height of the base at the start of an episode [m].
+        terrain: Largest roughness, and where in the task's ground it is.
+        make_task: Makes the composed task; True: on rough ground.
+        rooms: Contacts and rows of constraints that Warp has room for in a copy.
+    """
+
+    needs_gpu = True
+
+    def __init__(
+        self,
+        make_task: Callable[[bool], Ground],
+        joints: JointParameters,
+        height_m: float,
+        terrain: Terrain,
+        loads: tuple[float, float] = (-1.0, 3.0),
+        rooms: tuple[int, int] = (16, 96),
+        rough: bool = False,
+    ) -> None:
+        self._make_task, self.joints, self._height_m, self._terrain = make_task, joints, height_m, terrain
+        self._loads, self._rooms, self._rough = loads, rooms, rough
+
+    @cached_property
+    def task(self) -> Ground:
+        """The composed task."""
+        return self._make_task(self._rough)
+
+    @property
+    def tick_s(self) -> float:
+        return float(self.task.control_timestep)
+
+    def dynamics(self) -> list[Parameter]:
+        return [*self.around(), *self.joints.dynamics()]
+
+    def unidentified(self) -> dict[str, float]:
+        return {p.name: p.nominal for p in self.around() if p.name != STRENGTH}
+
+    def around(self) -> list[Parameter]:
+        """Return the parameters that are of no joint: legs in the air determine none of them."""
+        return [
+            Parameter(FRICTION, "1", 0.8, 0.2, 2.0, about="friction of the feet on the ground"),
+            Parameter(PAYLOAD, "kg", 0.0, *self._loads, "linear", about="load in the base"),
+            Parameter(STRENGTH, "1", 1.0, 0.5, 1.5, about="factor on the motors' gains"),
+            Parameter(ROUGHNESS, "m", 0.0, 0.0, self._terrain.most_m, "linear", about="height of bumps of the ground"),
+        ]
+
+    def for_training(self, values: Mapping[str, float], draws: Mapping[str, np.ndarray]) -> WalkingModel:
+        bumps_m = np.asarray(draws.get(ROUGHNESS, values.get(ROUGHNESS, 0.0)))
+        if not bumps_m.any():
+            return self
+        low, high, most_m = float(bumps_m.min()), float(bumps_m.max()), self._terrain.most_m
+        if low < 0.0 or high > most_m:
+            raise UsageError(
+                f"roughness must lie in [0, {most_m:g}] m, got {low:.3g} to {high:.3g}",
+                hint="`terrain = Terrain(most_m=0.2)` in the robot's file makes its ground rougher",
+            )
+        return WalkingModel(
+            self._make_task, self.joints, self._height_m, self._terrain, self._loads, self._rooms, rough=True
+        )
+
+    def make_world(self, resumed: bool = False) -> WalkingWorld:
+        del resumed
+        task, on_gpu = self.task, jax.default_backend() == "gpu"
+        places = {
+            FRICTION: (task.foot_geoms, "friction"),
+            "gain": (task.actuators, "gainprm"),
+            "bias": (task.actuators, "biasprm"),
+            "damping": (task.joints, "damping"),
+            "friction": (task.joints, "frictionloss"),
+        }
+        options = {"impl": "warp", "nconmax": self._rooms[0], "njmax": self._rooms[1]} if on_gpu else {}
+        return WalkingWorld(task, places, self._loads, **options)
+
+    def params(self, values: Mapping[str, Scalar], start: EpisodeStart) -> WorldParams:
+        """Return the world's parameters for an episode: the base is level and at rest.
+
+        On rough ground the base starts at the place that has the roughness, above the highest bump there.
+        """
+        usual, joints = self._world_params.values, self.joints
+        strength = jnp.asarray(values[STRENGTH], jnp.float32) * joints.of_motor(values, MOTOR_STRENGTH, jnp)
+        placed = {
+            FRICTION: usual[FRICTION].at[..., 0].set(values[FRICTION]),
+            "gain": usual["gain"] * strength[:, None],
+            "bias": usual["bias"] * strength[:, None],
+            "damping": joints.of_group(values, "damping", jnp),
+            "friction": joints.of_group(values, "friction", jnp),
+            ARMATURE: joints.of_group(values, "armature", jnp),
+            PAYLOAD: jnp.asarray(values[PAYLOAD], jnp.float32),
+        }
+        bumps_m = jnp.asarray(values[ROUGHNESS] if self.task.rough else 0.0, jnp.float32)
+        x_m = self._terrain.start_m(bumps_m) if self.task.rough else 0.0
+        base = jnp.array([x_m, 0.0, self._height_m + bumps_m, 1.0, 0.0, 0.0, 0.0], jnp.float32)
+        position, velocity = (jnp.asarray(x, jnp.float32) for x in (start.position, start.velocity))
+        return WorldParams(placed, jnp.concatenate([base, position]), jnp.concatenate([jnp.zeros(6), velocity]))
+
+    def true_state(self, state: PyTree) -> PyTree:
+        data, v = state.data, state.variables
+        position = data.qpos[2:]
+        if self.task.rough is not None:
+            position = position.at[0].add(-self.task.rough.at(data.qpos[:2]))
+        return position, data.qvel, data.actuator_force, v["air_s"], v["ground_s"], v["mean"]
+
+    @cached_property
+    def _world_params(self) -> WorldParams:
+        with jax.ensure_compile_time_eval():  # a cached array must not belong to the function that JAX traces now
+            return self.make_world().init_params()

@@ -6,9 +6,7 @@ from typing import Annotated, Literal
 
 from sim2real.errors import UsageError
 from sim2real.hardware.safety.limits import GateLimits
-from sim2real.stages.flag import Flag
-from sim2real.stages.live.config import ViewFlag, check_view
-from sim2real.stages.seed import check_seed
+from sim2real.stages.flag import Flag, ViewFlag, check_seed, check_view
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,7 @@ from sim2real.robots.loop import ACTUATOR, SENSOR
 from sim2real.robots.probe import Probe, StepAnswers, Witness, measure_delay
 from sim2real.robots.robot import Robot
 from sim2real.stages.deploy.config import DeployConfig
-from sim2real.stages.live.scene import scene_of
-from sim2real.stages.live.viewer import live_view
+from sim2real.stages.live import live_view, scene_of
 from sim2real.stages.session.episode import Bench, opened
 from sim2real.stages.terminal.console import note
 from sim2real.types import Json

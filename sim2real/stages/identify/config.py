@@ -5,8 +5,7 @@ from typing import Annotated
 
 from sim2real.errors import UsageError
 from sim2real.identification.config import FitConfig
-from sim2real.stages.flag import Flag
-from sim2real.stages.live.config import ViewFlag, check_view
+from sim2real.stages.flag import Flag, ViewFlag, check_view
 
 
 @dataclass(frozen=True)

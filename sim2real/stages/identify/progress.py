@@ -22,7 +22,7 @@ from sim2real.identification.parameters import ParameterTable
 from sim2real.identification.predictions import samples
 from sim2real.identification.problem import Problem
 from sim2real.stages.identify.inputs import Inputs
-from sim2real.stages.live.viewer import live_view
+from sim2real.stages.live import live_view
 from sim2real.stages.terminal.console import note, shown
 
 PARTIAL = "partial.json"

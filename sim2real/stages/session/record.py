@@ -14,8 +14,7 @@ from sim2real.installation import has_jax
 from sim2real.robots.loop import SENSOR
 from sim2real.robots.robot import RecordedRobot, Robot
 from sim2real.stages.check.config import CheckConfig
-from sim2real.stages.live.scene import scene_of
-from sim2real.stages.live.viewer import live_view
+from sim2real.stages.live import live_view, scene_of
 from sim2real.stages.load import AnyRobot, defaults_of, moving, robot_of
 from sim2real.stages.session.config import RecordConfig
 from sim2real.stages.session.episode import check_deadlines, opened, show_sessions

@@ -4,9 +4,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from sim2real.errors import UsageError
-from sim2real.stages.flag import Flag
-from sim2real.stages.live.config import ViewFlag, check_view
-from sim2real.stages.seed import check_seed
+from sim2real.stages.flag import Flag, ViewFlag, check_seed, check_view
 from sim2real.training.config import PPOConfig
 from sim2real.training.environment.variation import VariationConfig
 from sim2real.training.scale.hosts import HostsConfig

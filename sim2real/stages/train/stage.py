@@ -17,7 +17,7 @@ from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run import RUNNING, StageFolder, attempts, newest, open_stage, run_folders, sha256
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.robots.robot import RecordedRobot
-from sim2real.stages.live.viewer import live_view
+from sim2real.stages.live import live_view
 from sim2real.stages.load import AnyRobot, defaults_of, moving, robot_of
 from sim2real.stages.shared import arguments
 from sim2real.stages.shared.arguments import (

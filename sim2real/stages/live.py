@@ -1,0 +1,195 @@
+"""A viewer beside a stage, for ``--view``: a process of its own shows the files that the stage writes.
+
+The process runs at low priority. It shares no lock, no queue and no memory with the stage, so it cannot slow a control
+loop down except by the processor time that it takes.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from sim2real.errors import Sim2RealError
+from sim2real.robots.robot import RecordedRobot, Robot
+from sim2real.stages.terminal.console import note, shown
+from sim2real.types import Json
+from sim2real.view.live.follower import PERIOD_S, Follower
+from sim2real.view.model_scene import ModelScene
+from sim2real.view.rerun_recording import Scene
+from sim2real.view.rerun_viewer import open_viewer, rerun_module
+
+_START_S = 30.0
+"""Longest wait for the viewer, before torque goes on [s]."""
+_END_S, _LEAVE_S = 5.0, 1.0
+"""Longest waits for the last rows after the stage, and for the end of the process [s]."""
+_NICENESS = 10
+
+
+def scene_of(robot: RecordedRobot) -> dict[str, Json]:
+    """Return what another process needs to draw a robot; empty if the robot has no model."""
+    if not isinstance(robot, Robot):
+        return {}
+    columns = {name: fields["position"] for name, fields in robot.sensor.joints.items() if "position" in fields}
+    file = getattr(robot, "mjcf", None)  # of a walking robot, which has no model for others
+    return {"mjcf": robot.identified_mjcf(robot.nominal()) or (str(file) if file else None), "columns": columns}
+
+
+def drawn(scene: Mapping[str, Json]) -> Scene | None:
+    """Return the scene that ``scene_of`` describes; None without one."""
+    return ModelScene(scene["mjcf"], scene["columns"]) if scene.get("mjcf") else None
+
+
+# -- the stage's side
+
+
+@contextmanager
+def live_view(target: str | None, folder: Path, name: str, scene: Callable[[], Mapping[str, Json]]) -> Iterator[None]:
+    """Show the files of a folder in a viewer while the block runs.
+
+    A viewer that does not start, or ends early, is a warning: the stage runs on.
+
+    Args:
+        target: Value of the flag ``--view``; None: no viewer.
+        name: Name of the application in the viewer, which keeps one arrangement for each.
+        scene: Returns the robot to draw in 3-D, see ``scene_of``.
+    """
+    process = None if target is None else _started(target, folder, name, scene())
+    try:
+        yield
+    finally:
+        if process is not None:
+            _end(process)
+
+
+def _started(target: str, folder: Path, name: str, scene: Mapping[str, Json]) -> subprocess.Popen[str] | None:
+    """Start the process, and wait until its viewer is open; None if it does not open."""
+    is_file = target.endswith(".rrd") and "://" not in target
+    where = str(Path(target).absolute()) if is_file else target
+    order = {"target": where, "folder": str(Path(folder).absolute()), "name": name, **scene}
+    # In a session of its own, as Ctrl-C ends the stage, and the last rows come after it.
+    process = subprocess.Popen(
+        [sys.executable, "-m", "sim2real.stages.live"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        start_new_session=True,
+        env={**os.environ, "JAX_PLATFORMS": "cpu", "RUST_LOG": "off"},
+    )
+    with suppress(OSError):
+        print(json.dumps(order), file=process.stdin, flush=True)
+    message = _message(process, _START_S)
+    if "line" in message:
+        note(f"view: {message['line']}", urgent=True)
+        return process
+    silent = f"hangs for {_START_S:g} s" if process.poll() is None else "ended"
+    note(f"warning: no live view: {message.get('error') or f'its process {silent}'}")
+    if message.get("hint"):
+        note(f"hint: {message['hint']}")
+    _stop(process)
+    return None
+
+
+def _end(process: subprocess.Popen[str]) -> None:
+    """Let the process send the last rows; warn if it has failed."""
+    if process.stdin is not None:
+        with suppress(OSError):
+            process.stdin.close()  # the process then sends the last rows, and ends
+    message = _message(process, _END_S)
+    problem = message.get("error")
+    if not message:
+        problem = f"its process {'ended early' if process.poll() is not None else 'hangs'}"
+    elif message.get("dropped"):
+        problem = f"the viewer did not take {message['dropped']} updates"
+    if problem:
+        note(f"warning: the live view is not whole: {problem}; the stage and its files are")
+    _stop(process)
+
+
+def _stop(process: subprocess.Popen[str]) -> None:
+    with suppress(subprocess.TimeoutExpired):
+        process.wait(_LEAVE_S)
+    process.kill()
+    process.wait()
+    for pipe in (process.stdin, process.stdout):
+        if pipe is not None:
+            with suppress(OSError):
+                pipe.close()
+
+
+def _message(process: subprocess.Popen[str], wait_s: float) -> Mapping[str, Json]:
+    """Return the next message of the process; empty if none comes in time."""
+    if process.stdout is None or not select.select([process.stdout], [], [], wait_s)[0]:
+        return {}
+    line = process.stdout.readline()
+    return json.loads(line) if line.startswith("{") else {}
+
+
+# -- the process: it feeds the viewer until its standard input closes
+
+
+def main() -> None:
+    """Follow the folder that the first line of the standard input names."""
+    # The viewer inherits the priority: every other program comes first. Only Linux has the second one.
+    with suppress(OSError):
+        os.nice(_NICENESS)
+    with suppress(OSError, AttributeError):
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    order = json.loads(sys.stdin.readline())
+    try:
+        recording = rerun_module().RecordingStream(f"sim2real {order['name']}")
+        line = open_viewer(recording, order["target"])
+        follower = Follower(recording, lambda: [Path(order["folder"])], drawn(order))
+        _report(line=line)
+        while not select.select([sys.stdin], [], [], PERIOD_S)[0]:
+            follower.poll()
+        follower.poll()
+        _report(dropped=follower.close())
+    except Sim2RealError as error:
+        _report(error=error.args[0], hint=error.hint)
+
+
+def _report(**message: Json) -> None:
+    print(json.dumps(message), flush=True)
+
+
+# -- viewers that a command keeps open
+
+
+def follow(run_dir: Path, name: str, target: str, scene: Scene | None) -> None:
+    """Show the stages of a run while they write, from their beginning, until Ctrl-C.
+
+    Args:
+        target: See ``open_viewer``.
+
+    Raises:
+        Sim2RealError: The viewer does not start.
+    """
+    recording = rerun_module().RecordingStream(f"sim2real {name}")
+    note(f"view: {open_viewer(recording, target)}")
+    follower = Follower(recording, lambda: sorted(p for p in run_dir.iterdir() if p.is_dir()), scene)
+    note(f"following {shown(run_dir)}; Ctrl-C ends the view, not the run")
+    with suppress(KeyboardInterrupt):
+        while True:
+            follower.poll()
+            time.sleep(PERIOD_S)
+    follower.close()
+
+
+def serve(line: str) -> None:
+    """Print the address of a page, and wait for Ctrl-C."""
+    note(f"view: {line}; Ctrl-C ends it")
+    with suppress(KeyboardInterrupt):
+        while True:
+            time.sleep(1.0)
+
+
+if __name__ == "__main__":
+    main()

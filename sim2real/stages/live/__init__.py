@@ -1,1 +1,0 @@
-"""``--view``: a viewer beside a stage shows the files that the stage writes."""
