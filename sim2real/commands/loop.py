@@ -9,11 +9,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from sim2real.artifacts.bundle import Bundle, History
+from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.deployment import Deployment, Drift
-from sim2real.artifacts.identification import ROUND_TRIP, Estimate, Identification
+from sim2real.artifacts.identification import ROUND_TRIP, Identification
 from sim2real.artifacts.iterations import Iteration, iterations, iterations_table
 from sim2real.artifacts.paths import shown
 from sim2real.artifacts.recording import Recording
@@ -32,11 +30,6 @@ from sim2real.stages.terminal.console import artifact_table, note
 
 CallStage = Callable[[str, Any, Path | None], StageFolder]
 """Runs a stage: its name, its configuration, the run folder; returns the stage's folder."""
-MIN_SUCCESS = 0.95
-"""Success in simulation below which an iteration trains for longer instead of deploying."""
-_MAX_RETRIES = 2
-"""Bounds that widen without limit would hide a wrong model."""
-_LONGEST_DELAY_S = 1.0
 
 
 def run_all(robot: RecordedRobot, flags: RunFlags, call: CallStage) -> Path | None:
@@ -222,14 +215,14 @@ class _Iterating:
         return getattr(self.flags, stage)
 
     def _stage(self, stage: str, config: Any, run_dir: Path | None) -> StageFolder:
-        """Run a stage, with retries; record first where the logs of a deployment do not suffice to identify from.
+        """Run a stage; record first where the logs of a deployment do not suffice to identify from.
 
         A policy that holds still excites no parameter; one that balances amplifies errors a hundredfold.
         """
         if stage != "identify" or not config.log:
-            return self._with_retries(stage, config, run_dir)
+            return self.call(stage, config, run_dir)
         try:
-            folder = self._with_retries(stage, config, run_dir)
+            folder = self.call(stage, config, run_dir)
             if not (reason := _why_insufficient(Identification.load(folder.output("parameters")))):
                 return folder
         except DelayChanged:
@@ -238,22 +231,7 @@ class _Iterating:
             reason = str(error.args[0])
         note(f"the deployment's own logs do not suffice ({reason}): record, identify from that")
         recorded = self.call("record", self.flags.record, run_dir)
-        return self._with_retries("identify", replace(config, log=()), recorded.run_dir)
-
-    def _with_retries(self, stage: str, config: Any, run_dir: Path | None) -> StageFolder:
-        """Run a stage; again while an estimate lies at a bound, or a policy fails in simulation.
-
-        A worn robot leaves the bounds of a data sheet; a policy for more friction takes more steps to train.
-        """
-        folder = self.call(stage, config, run_dir)
-        for _ in range(_MAX_RETRIES):
-            changed = _changed_config(config, folder)
-            if changed is None:
-                break
-            config, reason = changed
-            note(f"{stage} again: {reason}")
-            folder = self.call(stage, config, folder.run_dir)
-        return folder
+        return self.call("identify", replace(config, log=()), recorded.run_dir)
 
     def _newest_identification(self, run_dir: Path) -> Identification:
         folder = finished(run_dir, "identify")
@@ -274,49 +252,6 @@ def _reached(deployment: Deployment, quantity: str, minimum: float) -> bool:
         raise UsageError(f"there is no {quantity!r} in the gap report. Available: {', '.join(on_robot) or 'none'}")
     real = on_robot[quantity]
     return real is not None and real >= minimum
-
-
-# -- retries
-
-
-def _changed_config(config: Any, folder: StageFolder) -> tuple[Any, str] | None:
-    """Return the configuration of a stage's retry and the reason for it; None if it needs no retry."""
-    if folder.stage == "identify":
-        found = Identification.load(folder.output("parameters"))
-        wider = with_wider_bounds(config, found)
-        at_bound = ", ".join(p.name for p in found.parameters if p.verdict == "at a bound")
-        return None if wider is None else (wider, f"wider bounds, as {at_bound} lies at a bound")
-    if folder.stage == "train" and "history" in folder.outputs:
-        success = History.load(folder.output("history")).success
-        enough = MIN_SUCCESS if config.ppo.target is None else min(MIN_SUCCESS, config.ppo.target)
-        if np.nanmax(success, initial=0.0) < enough:
-            longer = replace(config, ppo=replace(config.ppo, total_steps=2 * config.ppo.total_steps))
-            return longer, f"the policy succeeds in less than {enough:g} of the episodes in simulation; twice the steps"
-    return None
-
-
-def with_wider_bounds(config: IdentifyConfig, identification: Identification) -> IdentifyConfig | None:
-    """Return a configuration with wider bounds for each estimate that lies at one; None if there is none."""
-    wider = config
-    for estimate in identification.parameters if identification.verdict.status == "change the model" else ():
-        if estimate.verdict != "at a bound" or estimate.lower is None or estimate.upper is None:
-            continue
-        if estimate.unit == "s" and estimate.kind in ("delay", "derived"):
-            wider = replace(wider, max_delay_s=min(2.0 * config.max_delay_s, _LONGEST_DELAY_S))
-        else:
-            wider = replace(wider, bounds={**wider.bounds, estimate.name: _wider(estimate)})
-    return None if wider == config else wider
-
-
-def _wider(estimate: Estimate) -> tuple[float, float]:
-    """Return bounds that are four times as far away, or twice as wide if they reach 0, on the estimate's side."""
-    low, high = estimate.lower or 0.0, estimate.upper or 0.0
-    upper = high - estimate.estimate < estimate.estimate - low
-    if upper and low > 0.0 and high < 1.0 and estimate.unit in ("", "1"):
-        return low, 1.0 - (1.0 - high) / 4.0  # a share stays below 1
-    if low > 0.0:
-        return (low, 4.0 * high) if upper else (low / 4.0, high)
-    return (low, high + (high - low)) if upper else (low - (high - low), high)
 
 
 def _why_insufficient(identification: Identification) -> str:

@@ -1,6 +1,5 @@
 """``sim2real play``: a policy walks on a twin in C MuJoCo, in a window or into a moving picture."""
 
-import shutil
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,8 +40,8 @@ class PlayConfig:
     window: bool = False
     """Show it in MuJoCo's window; the arrow keys change forward velocity and yaw rate, comma and full stop the sideways
     one, the space bar stops."""
-    video: Annotated[Path | None, Flag("FILE.gif|FILE.mp4")] = None
-    """Moving picture to write, from the side; needs no display, and FFmpeg for .mp4."""
+    video: Annotated[Path | None, Flag("FILE.gif")] = None
+    """Moving picture to write, from the side; needs no display."""
     runs: Path = Path("runs")
     """Folder of all runs."""
 
@@ -52,8 +51,8 @@ class PlayConfig:
             raise UsageError(f"play takes up to 3600 s and pushes of 0 to 10 m/s, got {self.seconds} and {self.push}")
         if self.window and self.video:
             raise UsageError("play shows a window or writes a picture", hint="run it with one of them")
-        if self.video and self.video.suffix not in (".gif", ".mp4"):
-            raise UsageError(f"--video writes a .gif or a .mp4, got {self.video}", hint="--video walk.gif")
+        if self.video and self.video.suffix != ".gif":
+            raise UsageError(f"--video writes a .gif, got {self.video}", hint="--video walk.gif")
 
 
 def play(command: str, arguments: list[str]) -> None:
@@ -78,8 +77,6 @@ def run(config: PlayConfig) -> "Walked":
 
     if config.source is None:
         raise UsageError("play needs a pipeline, a run or a bundle", hint="sim2real play go2")
-    if config.video and config.video.suffix == ".mp4":
-        _ffmpeg()  # an error before the walk
     # Find the policy, and the robot that it is for.
     folder, pipelines = find_bundle(config.source, config.runs), available()
     names = (config.source, *(p.name for p in folder.resolve().parents))
@@ -129,16 +126,14 @@ def _window(twin: "Twin", wanted: "np.ndarray") -> Any:
 
 def _write_picture(twin: "Twin", qpos: "np.ndarray", out: Path) -> None:
     """Write the robot from the side, as a moving picture of its links."""
-    from matplotlib import rc_context
-    from matplotlib.animation import FFMpegWriter, PillowWriter
+    from matplotlib.animation import PillowWriter
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(4.8, 2.7), dpi=80, layout="constrained")
     axes = figure.subplots()
     every = max(1, round(twin.robot.rate_hz / _FRAMES_PER_S))
-    path: Any = {} if out.suffix == ".gif" else {"animation.ffmpeg_path": _ffmpeg()}
-    writer = (FFMpegWriter if path else PillowWriter)(fps=round(twin.robot.rate_hz / every))
-    with rc_context(path), writer.saving(figure, str(out), 80):
+    writer = PillowWriter(fps=round(twin.robot.rate_hz / every))
+    with writer.saving(figure, str(out), 80):
         for row in qpos[::every]:
             axes.clear()
             for start, end in twin.links(row):
@@ -147,10 +142,3 @@ def _write_picture(twin: "Twin", qpos: "np.ndarray", out: Path) -> None:
             axes.axhline(0.0, color="#1c2530", lw=1)
             axes.set(xlim=(row[0] - 0.7, row[0] + 0.7), ylim=(-0.05, 0.6), aspect="equal", xlabel="forwards [m]")
             writer.grab_frame()
-
-
-def _ffmpeg() -> str:
-    """Return the path of FFmpeg."""
-    if (path := shutil.which("ffmpeg")) is None:
-        raise UsageError("a .mp4 needs FFmpeg, which is not installed", hint="--video walk.gif needs no FFmpeg")
-    return path

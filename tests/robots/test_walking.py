@@ -77,11 +77,8 @@ def test_play_writes_a_picture(tmp_path, capsys):
     assert "walked for 0.5 s" in capsys.readouterr().err
 
 
-def test_a_film_without_ffmpeg_and_another_format_are_refused_before_the_walk(tmp_path, monkeypatch):
-    monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(UsageError, match="needs FFmpeg"):
-        run(PlayConfig("go2", video=tmp_path / "a.mp4"))
-    with pytest.raises(UsageError, match=r"a \.gif or a \.mp4"):
+def test_a_film_of_another_format_is_refused_before_the_walk(tmp_path):
+    with pytest.raises(UsageError, match=r"a \.gif"):
         PlayConfig("go2", video=tmp_path / "a.avi")
 
 

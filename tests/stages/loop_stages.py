@@ -5,9 +5,6 @@ import signal
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
-from sim2real.artifacts.bundle import History
 from sim2real.artifacts.deployment import Advice, Changed, Deployment, Drift, Gap, Scores
 from sim2real.artifacts.identification import ROUND_TRIP, Estimate, Identification, Judgement
 from sim2real.artifacts.run import STAGES, TAKES, Source, attempts, newest, open_stage
@@ -18,8 +15,6 @@ from sim2real.stages.load import load_robot
 
 TRIP = Estimate(ROUND_TRIP, "s", "derived", "", 0.0, 0.02, "ok")
 FRICTION = Changed("friction", "rad/s^2", 6.0, 12.0, 11.0, 13.0, 0.9, 1e-20)
-AT_BOUND = Estimate("friction", "rad/s^2", "dynamics", "", 6.0, 19.9, "at a bound", lower=0.1, upper=20.0)
-LATE = Estimate("delay", "s", "delay", "", 0.0, 0.06, "at a bound", lower=0.0, upper=0.06)
 
 
 def verdict(status, success=0.5, reason="why", seconds=18.0, drift=False):
@@ -37,12 +32,11 @@ class Stages:
         verdicts: Of each deployment that finishes: a status, a deployment, or an error that is raised.
         lacking: Identifications, by their number from 0, that show too little.
         judgements: Statuses of the identifications after the first one, in their order; "fails" is an error.
-        successes: Of the trainings, in simulation.
     """
 
-    def __init__(self, root, verdicts=("re-identify", "fine"), lacking=(), judgements=(), successes=()):
+    def __init__(self, root, verdicts=("re-identify", "fine"), lacking=(), judgements=()):
         self.root, self.verdicts, self.lacking = root, [*verdicts], lacking
-        self.judgements, self.successes = [*judgements], [*successes]
+        self.judgements = [*judgements]
         self.calls, self.die, self.refused = [], None, 0
 
     def __call__(self, stage, config, run_dir):
@@ -66,15 +60,12 @@ class Stages:
                 if status == "fails":
                     raise Sim2RealError("nothing could be simulated")
                 logs = tuple(Source.of(path, opened.run_dir) for path in inputs.values())
-                rows = (TRIP, AT_BOUND, LATE) if status == "change the model" else (TRIP,)
-                Identification("pendulum", logs, Judgement(status, (content,)), rows).write(
+                Identification("pendulum", logs, Judgement(status, (content,)), (TRIP,)).write(
                     opened.output("parameters", "parameters.json")
                 )
             if stage == "train":
                 opened.output("bundle", "bundle").mkdir()
                 (opened.folder / "bundle" / "policy.json").write_text(content)
-                curve = np.array([[self.successes.pop(0) if self.successes else 1.0]])
-                History(np.ones(1), np.ones(1), curve, curve).save(opened.output("history", "history.json"))
             if stage == "deploy":
                 opened.output("log_0", "episode_0.mcap").write_text(content)
                 found = self.verdicts[number + self.refused]

@@ -1,7 +1,5 @@
 """Around the loop: what each verdict makes a run do again, and when it stops."""
 
-from dataclasses import replace
-
 import pytest
 from loop_stages import Stages, verdict
 
@@ -9,7 +7,6 @@ from sim2real.artifacts.iterations import iterations
 from sim2real.artifacts.run import STAGES
 from sim2real.commands.run_flags import RunFlags
 from sim2real.errors import DelayChanged, UsageError
-from sim2real.stages.load import defaults_of
 from sim2real.view.sections import iterations_sections
 
 
@@ -69,41 +66,6 @@ def test_the_verdict_says_what_is_done_again_and_from_which_logs(world, found, s
     assert again == stages
     (config,) = (c for s, c in world.calls[4:] if s == "identify")
     assert ["/".join(log.split("/")[-2:]) for log in config.log] == logs
-
-
-def test_an_estimate_at_a_bound_is_identified_once_more_with_wider_ones(world, capsys):
-    world.judgements = ["change the model"]
-    again, rows = world.go(verdict("re-identify", drift=True), verdict("fine", 1.0))
-    assert again == ["identify", "identify", "train", "deploy"]
-    own, wider = (config for stage, config in world.calls[4:] if stage == "identify")
-    assert wider == replace(own, bounds={**own.bounds, "friction": (0.1, 80.0)}, max_delay_s=2 * own.max_delay_s)
-    assert rows[1].stages == ("identify.2", "identify.3", "train.2", "deploy.2")
-    assert "friction, delay" in capsys.readouterr().err
-
-
-def test_an_estimate_that_stays_at_a_bound_leads_to_a_recording_and_then_to_an_end(world):
-    """The model may be wrong: bounds are not moved for ever."""
-    world.judgements = ["change the model"] * 6
-    again, _ = world.go(verdict("re-identify", drift=True), verdict("fine", 1.0))
-    assert again == ["identify"] * 3 + ["record"] + ["identify"] * 3 + ["train", "deploy"]
-
-
-@pytest.mark.parametrize(
-    ("successes", "options", "again"),
-    [
-        ([0.7, 0.95], {}, ["train", "train", "deploy"]),
-        ([0.7, 0.9, 0.95], {}, ["train"] * 3 + ["deploy"]),
-        ([0.7] * 4, {}, ["train"] * 3 + ["deploy"]),
-        ([0.95], {}, ["train", "deploy"]),
-        ([0.7], {"target": 0.6}, ["train", "deploy"]),
-    ],
-)
-def test_a_policy_that_fails_in_simulation_is_trained_once_more_for_longer(world, successes, options, again):
-    world.successes, ppo = [1.0, *successes], replace(defaults_of("pendulum").train.ppo, **options)
-    done, _ = world.go(verdict("re-train", 0.6), verdict("fine", 1.0), train={"ppo": ppo})
-    assert done == again
-    steps = [config.ppo.total_steps for stage, config in world.calls if stage == "train"]
-    assert steps == [ppo.total_steps * n for n in (1, 1, 2, 4)][: len(steps)]
 
 
 LATER = DelayChanged("the delay is 60 ms", hint="record, identify and train again")

@@ -259,7 +259,7 @@ class MjcfRobot(LoggedRobot):
         """
         config, commands, spec = self.config, self.config.commands, read_spec(self.config.model)
         loop, named = self.identifiable(1.0), {p.what for p in self.placed}
-        world = loop.params(values, np.zeros(2 * len(config.joints)))["world"]
+        world = loop.driven(values)
         spec.option.timestep, spec.option.integrator = config.step_s, mj.mjtIntegrator.mjINT_IMPLICITFAST
         if named & {"tilt_x", "tilt_y"}:
             spec.option.gravity = np.asarray(world.model.opt.gravity, np.float64)
@@ -337,14 +337,17 @@ class IdentifiableMjcf(IdentifiableRecording):
         command = first[ACTUATOR]
         return {**params, "world": self._world.holding(params["world"], command)}
 
+    def driven(self, values: Mapping[str, Scalar]) -> DriveParams:
+        """Return the world's parameters with values in their places."""
+        return place(self._placed, values, self._params["world"], self.joints, self.dofs)
+
     def params(self, values: Mapping[str, Scalar], start: PyTree) -> dict[str, PyTree]:
         """Return node parameters.
 
         Args:
             start: Shape ``(2 * joints,)``: positions as measured, then velocities.
         """
-        tree = self.parameters.placed(self._params, values)
-        world = place(self._placed, values, tree["world"], self.joints, self.dofs)
+        tree, world = self.parameters.placed(self._params, values), self.driven(values)
         n = len(self.dofs)
         angle = start[:n] - world.zero
         speed = start[n:]
