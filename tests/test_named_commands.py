@@ -28,7 +28,7 @@ def options_of(command):
     """Return the flags of a command, of all pipelines: name -> option."""
     found = {}
 
-    def note(default, *_):
+    def note(default, *_, **__):
         for option in flags._options(default):
             found[option.name] = option
         raise SystemExit

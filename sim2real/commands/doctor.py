@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from sim2real.commands import flags
-from sim2real.commands.stages import examples_of, summary_of
 from sim2real.errors import ERROR, UsageError
 from sim2real.stages.flag import Flag
 from sim2real.stages.terminal.console import note, progress, wrote
@@ -37,10 +36,11 @@ class DoctorConfig:
 
 def doctor(command: str, arguments: list[str]) -> None:
     """``sim2real doctor --policy POLICY.onnx --log LOG --mjcf ROBOT.xml [--contract FILE]``."""
-    examples = examples_of(
-        "doctor --policy policy.onnx --log real.mcap --mjcf robot.xml", "doctor --policy policy.onnx --mjcf robot.xml"
+    examples = (
+        "doctor --policy policy.onnx --log real.mcap --mjcf robot.xml",
+        "doctor --policy policy.onnx --mjcf robot.xml",
     )
-    config = flags.parse(DoctorConfig(), arguments, f"sim2real {command}", summary_of(DoctorConfig()), examples)
+    config = flags.parse(DoctorConfig(), arguments, f"sim2real {command}", *examples)
     data, sentence, wrong = run(config)
     print(json.dumps(data, indent=2, default=float) if config.json else sentence)
     if wrong:

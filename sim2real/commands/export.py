@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from sim2real.commands import flags
-from sim2real.commands.stages import examples_of, summary_of
-from sim2real.errors import UsageError
+from sim2real.errors import Sim2RealError, UsageError
 from sim2real.runtime import compilation_cache
 from sim2real.stages.flag import Flag
 from sim2real.stages.load import available, folder_of, load_robot, shipped_policy
@@ -37,11 +36,8 @@ class ExportConfig:
 
 def export_(command: str, arguments: list[str]) -> None:
     """``sim2real export RUN|PIPELINE|FILE --to FORMAT``."""
-    examples = examples_of(
-        "export pendulum --to json", "export runs/arm/TIME --to mjcf --out arm.xml", "export go2 --to policy"
-    )
-    default = ExportConfig()
-    config = flags.parse(default, arguments, f"sim2real {command}", summary_of(default), examples)
+    examples = ("export pendulum --to json", "export runs/arm/TIME --to mjcf --out arm.xml", "export go2 --to policy")
+    config = flags.parse(ExportConfig(), arguments, f"sim2real {command}", *examples)
     compilation_cache.enable()
     run(config)
 
@@ -75,18 +71,11 @@ def run(config: ExportConfig) -> Path:
 def find_parameters(source: str, runs: Path) -> Path:
     """Return the file of the identification that a text names: a file, a stage folder, a pipeline or a run."""
     from sim2real.artifacts.identification import PARAMETERS
-    from sim2real.artifacts.run import newest, pipeline_of
-    from sim2real.stages.shared.find_run import find_run, warn_of_stale
 
     path = Path(source)
     if path.is_file():
         return path
-    if (path / PARAMETERS).is_file():
-        return path / PARAMETERS
-    if source in available():
-        return warn_of_stale(newest(runs, source, "identify")).output("parameters")
-    run_dir = find_run(runs, source)
-    return warn_of_stale(newest(runs, pipeline_of(run_dir), "identify", run_dir)).output("parameters")
+    return path / PARAMETERS if (path / PARAMETERS).is_file() else _output(source, runs, "identify", "parameters")
 
 
 def find_bundle(source: str, runs: Path) -> Path:
@@ -95,10 +84,7 @@ def find_bundle(source: str, runs: Path) -> Path:
     A pipeline without a training of its own gives the bundle that it ships.
     """
     from sim2real.artifacts.bundle import BUNDLE
-    from sim2real.artifacts.run import newest, pipeline_of
-    from sim2real.errors import Sim2RealError
     from sim2real.policy.bundle import CONTRACT
-    from sim2real.stages.shared.find_run import find_run, warn_of_stale
 
     for folder in (Path(source), Path(source) / BUNDLE):
         if (folder / CONTRACT).is_file():
@@ -109,15 +95,22 @@ def find_bundle(source: str, runs: Path) -> Path:
             "inputs and outputs mean, which a network alone does not",
             hint="a policy of another library becomes a bundle with sim2real.policy.bundle.save_bundle",
         )
-    if source in available():
-        try:
-            return warn_of_stale(newest(runs, source, "train")).output("bundle")
-        except Sim2RealError:
-            if (shipped := shipped_policy(folder_of(source))) is not None:
-                return shipped
-            raise
-    run_dir = find_run(runs, source)
-    return warn_of_stale(newest(runs, pipeline_of(run_dir), "train", run_dir)).output("bundle")
+    try:
+        return _output(source, runs, "train", "bundle")
+    except Sim2RealError:
+        if source in available() and (shipped := shipped_policy(folder_of(source))) is not None:
+            return shipped
+        raise
+
+
+def _output(source: str, runs: Path, stage: str, name: str) -> Path:
+    """Return an output of a stage: the newest of a pipeline, or of a run."""
+    from sim2real.artifacts.run import newest, pipeline_of
+    from sim2real.stages.shared.find_run import find_run, warn_of_stale
+
+    run_dir = None if source in available() else find_run(runs, source)
+    pipeline = source if run_dir is None else pipeline_of(run_dir)
+    return warn_of_stale(newest(runs, pipeline, stage, run_dir)).output(name)
 
 
 def _export_policy(bundle: Path, out: Path | None) -> Path:

@@ -14,7 +14,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal, NoReturn, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from sim2real.errors import UsageError
+from sim2real.errors import EXIT_CODES, UsageError
 from sim2real.stages.flag import Flag
 
 Config = TypeVar("Config")
@@ -74,11 +74,13 @@ class _Parser(argparse.ArgumentParser):
         raise UsageError(message.removeprefix("argument "), hint=f"see `{self.prog} --help`")
 
 
-def parse(default: Config, arguments: Sequence[str], prog: str, description: str, epilog: str = "") -> Config:
+def parse(default: Config, arguments: Sequence[str], prog: str, *examples: str, text: str = "") -> Config:
     """Return a configuration with the fields that the arguments name replaced.
 
     Args:
         default: A dataclass; its values are the defaults.
+        examples: Commands without ``sim2real``, for the end of the help.
+        text: What the command does; default: the first line of the configuration's docstring.
 
     Raises:
         UsageError: A flag is unknown, or a value does not fit.
@@ -86,7 +88,8 @@ def parse(default: Config, arguments: Sequence[str], prog: str, description: str
     """
     options = list(_options(default))
     if {"-h", "--help", "--help-all"} & set(arguments):
-        print(_help(options, prog, description, epilog, "--help-all" in arguments), flush=True)
+        text = text or (type(default).__doc__ or "").strip().splitlines()[0]
+        print(_help(options, prog, text, examples, "--help-all" in arguments), flush=True)
         raise SystemExit(0)
     # Let argparse assign the words to the flags.
     parser = _Parser(prog=prog, add_help=False, allow_abbrev=False, argument_default=argparse.SUPPRESS)
@@ -104,11 +107,6 @@ def parse(default: Config, arguments: Sequence[str], prog: str, description: str
         elif words:
             values[option.path] = _value(option, words, prog)
     return _replaced(default, values, ())
-
-
-def flags_of(config: Any) -> Iterator[tuple[str, Any]]:
-    """Yield the flags of a configuration and their values."""
-    yield from ((option.name, option.default) for option in _options(config))
 
 
 def _options(
@@ -233,12 +231,12 @@ def _unknown(unknown: Sequence[str], options: Sequence[_Option], prog: str) -> U
     return UsageError(f"unknown flag {', '.join(written)}{available}", hint=hint)
 
 
-def _help(options: Sequence[_Option], prog: str, description: str, epilog: str, everything: bool) -> str:
+def _help(options: Sequence[_Option], prog: str, text: str, examples: Sequence[str], everything: bool) -> str:
     """Return the help: one block of flags for each nested configuration."""
     values = [o for o in options if o.mark.positional]
     listed = [o for o in options if o not in values and (o.shown or everything)]
     usage = " ".join([prog, *(_placeholder(o) for o in values), "[FLAGS]"])
-    lines = [f"usage: {usage}", "", *textwrap.wrap(description, _width()), ""]
+    lines = [f"usage: {usage}", "", *textwrap.wrap(text, _width()), ""]
     for value in values:
         lines += _entry(_placeholder(value), value.text)
     block = ""
@@ -246,11 +244,12 @@ def _help(options: Sequence[_Option], prog: str, description: str, epilog: str, 
         prefix = option.name[2:].partition(".")[0] if "." in option.name else ""
         if prefix != block:
             lines, block = [*lines, "", prefix], prefix
-        text, default = option.text, _text(option.default)
-        lines += _entry(f"{option.name} {_placeholder(option)}".rstrip(), f"{text} [{default}]" if default else text)
+        default = _text(option.default)
+        about = f"{option.text} [{default}]" if default else option.text
+        lines += _entry(f"{option.name} {_placeholder(option)}".rstrip(), about)
     if hidden := len(options) - len(values) - len(listed):
         lines += ["", f"--help-all lists {hidden} more flags."]
-    return "\n".join([*lines, *(["", epilog] if epilog else [])])
+    return "\n".join([*lines, "", "examples", *(f"  sim2real {example}" for example in examples), "", EXIT_CODES])
 
 
 def _entry(head: str, text: str) -> list[str]:

@@ -8,14 +8,14 @@ from typing import Annotated, Any
 
 from sim2real.artifacts.files import plain
 from sim2real.artifacts.run import STAGES, attempts, run_folders, stage_status, versions
-from sim2real.commands import flags, stages
-from sim2real.commands.stages import DEMO_PIPELINE, examples_of
+from sim2real.commands import flags
+from sim2real.commands.stages import DEMO_PIPELINE
 from sim2real.errors import Sim2RealError
 from sim2real.hardware import entries
 from sim2real.installation import has_jax
 from sim2real.runtime import compilation_cache
 from sim2real.stages.flag import Flag
-from sim2real.stages.load import available, defaults_of, folder_of, load_robot, summary_of
+from sim2real.stages.load import available, folder_of, load_robot, summary_of
 from sim2real.stages.shared.find_run import find_run
 from sim2real.stages.terminal.console import pairs, shown, table
 
@@ -28,21 +28,18 @@ class InfoConfig:
     """A pipeline, an MCAP log, or a run folder; default: the installation."""
     runs: Path = Path("runs")
     """Folder of all runs."""
-    verbose: bool = False
-    """Print the default of every flag of a pipeline's stages."""
 
 
 def info(command: str, arguments: list[str]) -> None:
     """``sim2real info [PIPELINE|LOG|RUN]``."""
-    default = InfoConfig()
-    examples = examples_of("info", f"info {DEMO_PIPELINE}", f"info runs/{DEMO_PIPELINE}/TIME")
-    config = flags.parse(default, arguments, f"sim2real {command}", stages.summary_of(default), examples)
+    examples = ("info", f"info {DEMO_PIPELINE}", f"info runs/{DEMO_PIPELINE}/TIME")
+    config = flags.parse(InfoConfig(), arguments, f"sim2real {command}", *examples)
     if config.target is None:
         print(installation())
     elif Path(config.target).is_file():
         print(log(Path(config.target)))
     elif config.target in available():
-        print(pipeline(config.target, config.runs, config.verbose))
+        print(pipeline(config.target, config.runs))
     else:
         print(run(find_run(config.runs, config.target)))
 
@@ -75,8 +72,8 @@ def _programs() -> str:
     return f"{shown(folder)}, {compilation_cache.size_bytes(folder) / 1e6:.0f} MB"
 
 
-def pipeline(name: str, root: Path, verbose: bool) -> str:
-    """Return a pipeline's files, runs and next command, in ten lines; ``verbose`` adds the default of each flag."""
+def pipeline(name: str, root: Path) -> str:
+    """Return a pipeline's files, runs and next command, in ten lines."""
     # Names, folder and the state of the newest run.
     runs = run_folders(root, name)
     head = {
@@ -90,14 +87,7 @@ def pipeline(name: str, root: Path, verbose: bool) -> str:
         states = [f"{stage} {stages.get(stage, 'not finished')}" for stage in STAGES]
         head |= {"newest run": runs[-1].name, "its stages": ", ".join(states)}
     head["commands"] = _commands(name)
-    if not verbose:
-        return pairs(head | {"defaults of flags": f"sim2real info {name} --verbose"})
-    # The default of each flag, one table for each stage.
-    blocks = [pairs(head)]
-    for stage in STAGES:
-        config = getattr(defaults_of(name), stage)
-        blocks.append(table(flags.flags_of(config), [stage, "default"]))
-    return "\n\n".join(blocks)
+    return pairs(head | {"defaults of flags": f"sim2real run {name} --help-all"})
 
 
 def _commands(name: str) -> str:

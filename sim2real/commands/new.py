@@ -8,19 +8,15 @@ import tempfile
 import webbrowser
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import Annotated, Any, Literal
 
 from sim2real.commands import flags
-from sim2real.commands.stages import examples_of, run_stage, summary_of
+from sim2real.commands.stages import run_stage
 from sim2real.errors import ERROR, UsageError
 from sim2real.runtime import compilation_cache
 from sim2real.stages.flag import Flag
 from sim2real.stages.load import available, defaults_of, load_module, load_robot
 from sim2real.stages.shared.robot_flags import RobotFlags
-
-if TYPE_CHECKING:
-    from sim2real.log.importing.mapping import ImportMapping
-    from sim2real.robots.model.robot import RobotConfig
 
 _COMMANDS = {
     "position": ("goal",),
@@ -29,7 +25,9 @@ _COMMANDS = {
     "duty": ("duty",),
     "mit": ("goal", "goal_velocity", "torque", "kp", "kd"),
 }
-_INIT = '''"""{summary}."""
+_SILENCE_S = 1.0  # torque is off, so a lost answer is no danger
+_OF_MODEL = {
+    "__init__.py": '''"""Recorded robot of {joints} joints, identified from its model."""
 
 from dataclasses import replace
 
@@ -39,18 +37,18 @@ DEFAULTS = Defaults(
     # Every field of sim2real.stages.config.IdentifyConfig may stand here: how long segments are, which delays may be.
     identify=replace(MODEL_IDENTIFY, horizon_s={horizon_s:g}, max_delay_s={max_delay_s:g}),
 )
-'''
-_ROBOT = '''"""The robot: robot.toml has the recorded joints, their drives, and the parameters to identify."""
+''',
+    "robot.py": '''"""The robot: robot.toml has the recorded joints, their drives, and the parameters to identify."""
 
 from pathlib import Path
 
 from sim2real.robots.model.robot import MjcfRobot, ROBOT_FILE, RobotConfig
 
 ROBOT = MjcfRobot(RobotConfig.load(Path(__file__).with_name(ROBOT_FILE)))
-'''
-_CALIBRATION: Final = "calibration.json"
-_SILENCE_S: Final = 1.0  # torque is off, so a lost answer is no danger
-_LIKE_INIT = '''"""A robot like {like}, with its own calibration."""
+''',
+}
+_OF_LIKE = {
+    "__init__.py": '''"""A robot like {like}, with its own calibration."""
 
 from dataclasses import replace
 
@@ -62,15 +60,17 @@ DEFAULTS = replace(
     record=replace(LIKE.record, port={port!r}),
     deploy=replace(LIKE.deploy, port={port!r}),
 )
-'''
-_LIKE_ROBOT = '''"""The robot, with the calibration beside this file."""
+''',
+    "robot.py": '''"""The robot, with the calibration beside this file."""
 
 from pathlib import Path
 
 from sim2real.stages.load import load_module
 
 ROBOT = load_module("{like}", "guide").robot(Path(__file__).with_name("calibration.json"))
-'''
+''',
+}
+"""Texts of the files of a pipeline: of a model, and of a robot like another one."""
 
 
 @dataclass(frozen=True)
@@ -97,31 +97,31 @@ class NewConfig:
 
 def new(command: str, arguments: list[str]) -> None:
     """``sim2real new NAME --mjcf ROBOT.xml [--log FILE]``, or ``sim2real new NAME --like PIPELINE --port PORT``."""
-    default = NewConfig()
-    examples = examples_of("new go2 --mjcf go2.xml --log run.csv", "new my_arm --like so101 --port /dev/ttyACM0")
-    config = flags.parse(default, arguments, f"sim2real {command}", summary_of(default), examples)
+    examples = ("new go2 --mjcf go2.xml --log run.csv", "new my_arm --like so101 --port /dev/ttyACM0")
+    config = flags.parse(NewConfig(), arguments, f"sim2real {command}", *examples)
     compilation_cache.enable()
-    if not run(config):
+    if config.like is None:
+        _from_model(config)
+    elif not _run_like(config, config.like):
         sys.exit(ERROR)
 
 
-def run(config: NewConfig) -> bool:
-    """Write a pipeline's folder; with ``--like`` also calibrate, record and identify the robot on the port.
-
-    Returns:
-        False if the identification was not accepted.
+def _from_model(config: NewConfig) -> None:
+    """Write a pipeline's folder for a model.
 
     Raises:
         UsageError: The name is none, the folder exists, or the model cannot be driven.
     """
-    if config.like is not None:
-        return _run_like(config)
+    import msgspec
+
     from sim2real.log.importing.mapping import MAPPING, to_toml
+    from sim2real.robots.model.drives import joints_of
     from sim2real.robots.model.file import read_model
     from sim2real.robots.model.parameters import expand
+    from sim2real.robots.model.robot import RobotConfig
     from sim2real.stages.config import MODEL_IDENTIFY
-    from sim2real.stages.shared.from_model import files_of, note_held
-    from sim2real.stages.terminal.console import note, wrote
+    from sim2real.stages.shared.from_model import describe, describe_robot, files_of, note_held
+    from sim2real.stages.terminal.console import note
 
     example = "sim2real new go2 --mjcf go2.xml --log run.csv"
     _check_name(config.name, example)
@@ -130,47 +130,36 @@ def run(config: NewConfig) -> bool:
     folder = config.folder / config.name
     if folder.exists():
         raise UsageError(f"{folder} exists", hint="choose another name, or delete it")
-    robot, mapping = _described(config)
+    # Describe the robot by its log; without one, by the flags alone.
+    mapping = None
+    if config.log is not None:
+        found = describe_robot(config.robot, [config.log])
+        robot, mapping = found.robot, found.mapping
+    else:
+        joints = config.robot.joints or joints_of(read_model(config.robot.mjcf))
+        rate_hz, step_s = config.robot.rate_hz or RobotConfig.rate_hz, config.robot.step_s or RobotConfig.step_s
+        robot = describe(config.robot, joints, _COMMANDS[config.drive], rate_hz, step_s, config.drive == "mit")
+        note_held(robot)
     # Refuse a robot that cannot run before a file is written.
     expand(robot.terms, robot.joints, robot.driven(), read_model(robot.model))
-    if config.log is None:
-        note_held(robot)
-    summary = f"recorded robot of {len(robot.joints)} joints, identified from its model"
-    lengths = {"horizon_s": MODEL_IDENTIFY.horizon_s, "max_delay_s": MODEL_IDENTIFY.max_delay_s}
-    texts = {
-        "__init__.py": _INIT.format(name=config.name, summary=summary, **lengths),
-        "robot.py": _ROBOT,
-        **files_of(robot),
-        **({} if mapping is None else {MAPPING: to_toml(mapping)}),
-    }
-    folder.mkdir(parents=True)
+    usual = {"horizon_s": MODEL_IDENTIFY.horizon_s, "max_delay_s": MODEL_IDENTIFY.max_delay_s}
+    texts = {name: text.format(joints=len(robot.joints), **usual) for name, text in _OF_MODEL.items()}
+    texts |= files_of(robot)
+    if mapping is not None:
+        texts[MAPPING] = to_toml(msgspec.structs.replace(mapping, pipeline=config.name))
+    _write(folder, texts)
+    if config.log:
+        log = f"{config.name} --log {config.log}"
+        note(f"next: sim2real check {log}; sim2real identify {log}")
+
+
+def _write(folder: Path, texts: dict[str, str]) -> None:
+    from sim2real.stages.terminal.console import wrote
+
+    folder.mkdir(parents=True, exist_ok=True)
     for name, text in texts.items():
         (folder / name).write_text(text, encoding="utf-8")
         wrote(folder / name)
-    if config.log:
-        note(
-            f"next: sim2real check {config.name} --log {config.log}; sim2real identify {config.name} --log {config.log}"
-        )
-    return True
-
-
-def _described(config: NewConfig) -> "tuple[RobotConfig, ImportMapping | None]":
-    """Return the robot's description and the mapping of its log; without a log, by the flags alone."""
-    import msgspec
-
-    from sim2real.robots.model.drives import joints_of
-    from sim2real.robots.model.file import read_model
-    from sim2real.robots.model.robot import RobotConfig
-    from sim2real.stages.shared.from_model import describe, describe_robot
-
-    if config.log is not None:
-        found = describe_robot(config.robot, [config.log])
-        if found.mapping is None:
-            return found.robot, None
-        return found.robot, msgspec.structs.replace(found.mapping, pipeline=config.name)
-    joints = config.robot.joints or joints_of(read_model(Path(str(config.robot.mjcf))))
-    rate_hz, step_s = config.robot.rate_hz or RobotConfig.rate_hz, config.robot.step_s or RobotConfig.step_s
-    return describe(config.robot, joints, _COMMANDS[config.drive], rate_hz, step_s, config.drive == "mit"), None
 
 
 def _check_name(name: str, example: str) -> None:
@@ -181,7 +170,7 @@ def _check_name(name: str, example: str) -> None:
 # -- a robot like a shipped one
 
 
-def _run_like(config: NewConfig) -> bool:
+def _run_like(config: NewConfig, like: str) -> bool:
     """Check or make the calibration, write the pipeline, record, identify, and open the page.
 
     Returns:
@@ -194,18 +183,28 @@ def _run_like(config: NewConfig) -> bool:
     from sim2real.artifacts.identification import Identification
     from sim2real.stages.terminal.console import wrote
 
-    like, port, folder = _checked(config)
-    guide = load_module(like, "guide")
+    sources = available()
+    able = sorted(n for n, s in sources.items() if isinstance(s, Path) and (s / "guide.py").is_file())
+    if like not in able:
+        raise UsageError(f"--like {like}: no such robot. Available: {', '.join(able)}")
+    example = f"sim2real new my_arm --like {like} --port /dev/ttyACM0"
+    _check_name(config.name, example)
+    if config.port is None or config.robot.mjcf is not None or config.log is not None:
+        raise UsageError("--like needs the --port of the robot, and neither a model nor a log", hint=example)
+    if config.folder.resolve() != Path("pipelines").resolve() or config.name in sources:
+        raise UsageError(
+            f"the pipeline {config.name!r} exists already, or --folder is not ./pipelines",
+            hint="choose another name, or delete it",
+        )
+    folder = config.folder / config.name
     with tempfile.TemporaryDirectory() as temporary:
         # Find faults of the arm before a motor moves.
-        calibration = Path(temporary) / _CALIBRATION
-        calibrate(port, guide, calibration)
+        calibration = Path(temporary) / "calibration.json"
+        calibrate(config.port, load_module(like, "guide"), calibration)
         folder.mkdir(parents=True)
-        shutil.copy(calibration, folder / _CALIBRATION)
-    wrote(folder / _CALIBRATION)
-    for name, text in (("__init__.py", _LIKE_INIT), ("robot.py", _LIKE_ROBOT)):
-        (folder / name).write_text(text.format(name=config.name, like=like, port=port), encoding="utf-8")
-        wrote(folder / name)
+        shutil.copy(calibration, folder)
+    wrote(folder / calibration.name)
+    _write(folder, {name: text.format(like=like, port=config.port) for name, text in _OF_LIKE.items()})
     # The only question: from here on the arm moves.
     robot, defaults = load_robot(config.name), defaults_of(config.name)
     _ask(f"The arm moves next, for {defaults.record.duration_s:g} s: let go of it, clear its table, and press Enter. ")
@@ -256,24 +255,6 @@ def calibrate(port: str, guide: Any, path: Path) -> None:
             shutil.copy(source, path)
     guide.read(path)
     note("the calibration fits the arm", urgent=True)
-
-
-def _checked(config: NewConfig) -> tuple[str, str, Path]:
-    """Return the name of the like robot, the port and the new folder; refuse flags that do not fit."""
-    sources = available()
-    able = sorted(n for n, s in sources.items() if isinstance(s, Path) and (s / "guide.py").is_file())
-    if config.like not in able:
-        raise UsageError(f"--like {config.like}: no such robot. Available: {', '.join(able)}")
-    example = f"sim2real new my_arm --like {config.like} --port /dev/ttyACM0"
-    _check_name(config.name, example)
-    if config.port is None or config.robot.mjcf is not None or config.log is not None:
-        raise UsageError("--like needs the --port of the robot, and neither a model nor a log", hint=example)
-    if config.folder.resolve() != Path("pipelines").resolve() or config.name in sources:
-        raise UsageError(
-            f"the pipeline {config.name!r} exists already, or --folder is not ./pipelines",
-            hint="choose another name, or delete it",
-        )
-    return config.like, config.port, config.folder / config.name
 
 
 def _ask(question: str) -> None:

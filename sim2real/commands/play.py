@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from sim2real.commands import flags
 from sim2real.commands.export import find_bundle
-from sim2real.commands.stages import examples_of, summary_of
 from sim2real.errors import UsageError
 from sim2real.stages.flag import Flag
 from sim2real.stages.load import available, load_robot
@@ -57,9 +56,8 @@ class PlayConfig:
 
 def play(command: str, arguments: list[str]) -> None:
     """``sim2real play RUN|PIPELINE|BUNDLE [FLAGS]``."""
-    default = PlayConfig()
-    examples = examples_of("play go2", "play go2 --command 0.5 0 0.4 --video walk.gif", "play go2 --window")
-    run(flags.parse(default, arguments, f"sim2real {command}", summary_of(default), examples))
+    examples = ("play go2", "play go2 --command 0.5 0 0.4 --video walk.gif", "play go2 --window")
+    run(flags.parse(PlayConfig(), arguments, f"sim2real {command}", *examples))
 
 
 def run(config: PlayConfig) -> "Walked":

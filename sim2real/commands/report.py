@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from sim2real.commands import flags
-from sim2real.commands.stages import examples_of
 from sim2real.errors import UsageError
 from sim2real.stages.flag import WINDOW, Flag, is_viewer
 from sim2real.stages.load import available
@@ -58,9 +57,8 @@ class ReportConfig:
 
 def report_command(command: str, arguments: list[str]) -> None:
     """``sim2real report RUN|PIPELINE... [FLAGS]``."""
-    examples = examples_of("report pendulum", "report pendulum --rerun", "report runs/NAME/MONDAY runs/NAME/FRIDAY")
-    text = "Write a run as one HTML page, show it in the Rerun viewer, or compare runs of one robot."
-    config = flags.parse(ReportConfig(), arguments, f"sim2real {command}", text, examples)
+    examples = ("report pendulum", "report pendulum --rerun", "report runs/NAME/MONDAY runs/NAME/FRIDAY")
+    config = flags.parse(ReportConfig(), arguments, f"sim2real {command}", *examples)
     targets: tuple[str, ...] = config.targets
     if not targets:
         names = ", ".join(sorted(available())) or "none"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from sim2real.commands import flags
 from sim2real.commands.run_flags import DemoFlags, RunFlags
-from sim2real.commands.stages import DEMO_PIPELINE, examples_of, run_stage, split_pipeline, write_report
+from sim2real.commands.stages import DEMO_PIPELINE, run_stage, split_pipeline, write_report
 from sim2real.errors import UsageError
 from sim2real.runtime import compilation_cache
 from sim2real.stages.load import defaults_of, load_robot
@@ -28,12 +28,8 @@ def run_command(command: str, arguments: list[str]) -> None:
     """``sim2real run PIPELINE [FLAGS]``."""
     name, rest = split_pipeline(command, arguments)
     default = RunFlags(**defaults_of(name).in_a_run)
-    examples = examples_of(
-        f"run {name} --seed 3 --record.duration-s 20",
-        f"run {name} --resume runs/{name}/TIME",
-        f"run {name} --iterations 5 --until success=0.95",
-    )
-    texts = (f"sim2real run {name}", "Record, identify, train and deploy, one after the other.", examples)
+    examples = ("--seed 3 --record.duration-s 20", f"--resume runs/{name}/TIME", "--iterations 5 --until success=0.95")
+    texts = (f"sim2real run {name}", *(f"run {name} {example}" for example in examples))
     parsed = flags.parse(default, rest, *texts)
     # The seed is the default of every stage: the seed flag of a stage overrides it.
     _run(name, flags.parse(default.with_seed(parsed.seed), rest, *texts))
@@ -41,9 +37,8 @@ def run_command(command: str, arguments: list[str]) -> None:
 
 def demo(command: str, arguments: list[str]) -> None:
     """``sim2real demo [FLAGS]``: ``run`` with the embedded pendulum's defaults."""
-    text = f"Record, identify, train and deploy the embedded {DEMO_PIPELINE}, with its defaults."
-    examples = examples_of("demo --seed 1", f"run {DEMO_PIPELINE} --help")
-    parsed = flags.parse(DemoFlags(), arguments, f"sim2real {command}", text, examples)
+    examples = ("demo --seed 1", f"run {DEMO_PIPELINE} --help")
+    parsed = flags.parse(DemoFlags(), arguments, f"sim2real {command}", *examples)
     configs = defaults_of(DEMO_PIPELINE).in_a_run
     _run(DEMO_PIPELINE, RunFlags(**{**vars(parsed), **configs}).with_seed(parsed.seed))
 

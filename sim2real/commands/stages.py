@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Generic, TypeVar
 
 from sim2real.commands import flags
-from sim2real.errors import ERROR, EXIT_CODES, UsageError
+from sim2real.errors import ERROR, UsageError
 from sim2real.installation import has_jax
 from sim2real.runtime import compilation_cache
 from sim2real.stages.flag import Flag
@@ -41,8 +41,9 @@ def stage(command: str, arguments: list[str]) -> None:
     """``sim2real record|identify|train|deploy PIPELINE [FLAGS]``."""
     name, rest = split_pipeline(command, arguments)
     default = getattr(defaults_of(name), command)
-    examples = examples_of(f"{command} {name} --runs /data/runs", f"report {name}")
-    parsed = flags.parse(StageFlags(default), rest, f"sim2real {command} {name}", summary_of(default), examples)
+    examples = (f"{command} {name} --runs /data/runs", f"report {name}")
+    text = (type(default).__doc__ or "").strip().splitlines()[0]
+    parsed = flags.parse(StageFlags(default), rest, f"sim2real {command} {name}", *examples, text=text)
     compilation_cache.enable(parsed.cache)
     run_dir = None
     if parsed.run:
@@ -58,9 +59,9 @@ def check(command: str, arguments: list[str]) -> None:
 
     name, rest = split_pipeline(command, arguments)
     default = CheckConfig(record=defaults_of(name).record)
-    description = f"{summary_of(default)} Ends with code 1 if a parameter is not determined."
-    examples = examples_of(f"check {name} --log session.mcap", f"check {name} --plan --record.duration-s 60")
-    config = flags.parse(default, rest, f"sim2real check {name}", description, examples)
+    examples = (f"check {name} --log session.mcap", f"check {name} --plan --record.duration-s 60")
+    text = f"{(CheckConfig.__doc__ or '').splitlines()[0]} Ends with code 1 if a parameter is not determined."
+    config = flags.parse(default, rest, f"sim2real check {name}", *examples, text=text)
     compilation_cache.enable()
     _end(_imported("check").run(load_robot(name), config))
 
@@ -69,13 +70,12 @@ def validate(command: str, arguments: list[str]) -> None:
     """``sim2real validate PARAMETERS --log FILE [FLAGS]``."""
     from sim2real.stages.validate.config import ValidateConfig
 
-    default = ValidateConfig()
-    description = (
-        f"{summary_of(default)} Ends with code 1 if an error exceeds the expected one, a baseline predicts as well, or "
-        "a log is not scored."
+    text = (
+        f"{(ValidateConfig.__doc__ or '').splitlines()[0]} Ends with code 1 if an error exceeds the expected one, a "
+        "baseline predicts as well, or a log is not scored."
     )
-    examples = examples_of("validate runs/NAME/TIME/identify --log b.mcap")
-    config = flags.parse(default, arguments, f"sim2real {command}", description, examples)
+    example = "validate runs/NAME/TIME/identify --log b.mcap"
+    config = flags.parse(ValidateConfig(), arguments, f"sim2real {command}", example, text=text)
     compilation_cache.enable()
     _end(_imported("validate").run(config))
 
@@ -84,10 +84,8 @@ def import_files(command: str, arguments: list[str]) -> None:
     """``sim2real import FILE... [FLAGS]``."""
     from sim2real.stages.import_logs.config import ImportConfig
 
-    default = ImportConfig()
-    examples = examples_of("import run.csv --mjcf robot.xml", "import DATASET --like so101", "info LOG")
-    config = flags.parse(default, arguments, f"sim2real {command}", summary_of(default), examples)
-    _imported("import_logs").run(config)
+    examples = ("import run.csv --mjcf robot.xml", "import DATASET --like so101", "info LOG")
+    _imported("import_logs").run(flags.parse(ImportConfig(), arguments, f"sim2real {command}", *examples))
 
 
 def run_stage(
@@ -143,16 +141,6 @@ def split_pipeline(command: str, arguments: list[str]) -> tuple[str, list[str]]:
             hint=f"sim2real {command} PIPELINE [FLAGS]; `sim2real new` makes a pipeline of a model",
         )
     return arguments[0], arguments[1:]
-
-
-def summary_of(config: object) -> str:
-    """Return the first line of the docstring of a configuration's class."""
-    return (type(config).__doc__ or "").strip().splitlines()[0]
-
-
-def examples_of(*commands: str) -> str:
-    """Return the text below the flags in ``--help``: examples and exit codes."""
-    return "\n".join(["examples", *(f"  sim2real {command}" for command in commands), "", EXIT_CODES])
 
 
 def module_of(stage: str) -> str:

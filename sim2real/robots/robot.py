@@ -244,7 +244,30 @@ class RobotTask(ABC):
         """
 
 
-class RobotModel(ABC):
+class Simulated:
+    """What exports and the drift test ask of a robot's model.
+
+    Attributes:
+        profile_rad_s: Speed of the actuators' setpoints towards their goals [rad/s]; infinite: at once.
+        causes: Causes that change several parameters at once: name -> parameter -> change of the parameter on its scale
+            when the cause grows by a factor of e.
+        export_lead_s: Time that a simulation of ``identified_mjcf`` in C MuJoCo adds to the delay of commands [s].
+    """
+
+    profile_rad_s: float = math.inf
+    causes: Mapping[str, Mapping[str, float]] = _NOTHING
+    export_lead_s: float = 0.0
+
+    def identified_mjcf(self, values: Mapping[str, Scalar]) -> str | None:
+        """Return the model with identified values, as MJCF; None: there is none."""
+        return None
+
+    def plain_simulation(self, values: Mapping[str, float]) -> PlainSimulation | None:
+        """Return the robot with identified values as a simulation in plain MuJoCo; None: there is none."""
+        return None
+
+
+class RobotModel(Simulated, ABC):
     """The robot in simulation, and the parameters that identification estimates.
 
     An entry point of the group ``sim2real.worlds`` makes one from a robot, for ``--world NAME``.
@@ -253,16 +276,12 @@ class RobotModel(ABC):
         tick_s: The world's period [s].
         lead_s: Time that the world adds to the actuator's delay [s]; see ``MjxWorld``.
         watched_terms: Optional terms that may change between deployments.
-        profile_rad_s, causes, export_lead_s: See ``RecordedRobot``.
         needs_gpu: Whether a training takes hours without a GPU.
     """
 
     tick_s: float
     lead_s: float = 0.0
     watched_terms: tuple[str, ...] = ()
-    profile_rad_s: float = math.inf
-    causes: Mapping[str, Mapping[str, float]] = _NOTHING
-    export_lead_s: float = 0.0
     needs_gpu: bool = False
 
     @abstractmethod
@@ -289,20 +308,12 @@ class RobotModel(ABC):
         """Return the part of the world's state that a value function may observe in simulation; default: all of it."""
         return state
 
-    def identified_mjcf(self, values: Mapping[str, Scalar]) -> str | None:
-        """Return the model with identified values, as MJCF; None: there is none."""
-        return None
-
-    def plain_simulation(self, values: Mapping[str, float]) -> PlainSimulation | None:
-        """Return the robot with identified values as a simulation in plain MuJoCo; None: there is none."""
-        return None
-
     def following(self, values: Mapping[str, float]) -> Following | None:
         """Return how joints with identified values follow their commands; None: as the device says."""
         return None
 
 
-class RecordedRobot(ABC):
+class RecordedRobot(Simulated, ABC):
     """A robot that was recorded: what identification needs.
 
     Attributes:
@@ -311,10 +322,6 @@ class RecordedRobot(ABC):
         defaults: Default settings of its stages; None: those of ``sim2real.stages.config.Defaults``.
         mapping: Mapping of its logs of other recorders, if it has no folder; a folder has an ``import.toml``.
         units: Field of a message -> its unit.
-        profile_rad_s: Speed of the actuators' setpoints towards their goals [rad/s]; infinite: at once.
-        causes: Causes that change several parameters at once: name -> parameter -> change of the parameter on its scale
-            when the cause grows by a factor of e.
-        export_lead_s: Time that a simulation of ``identified_mjcf`` in C MuJoCo adds to the delay of commands [s].
     """
 
     name: str = ""
@@ -322,9 +329,6 @@ class RecordedRobot(ABC):
     defaults: Defaults | None = None
     mapping: ImportMapping | None = None
     units: Mapping[str, str]
-    profile_rad_s: float = math.inf
-    causes: Mapping[str, Mapping[str, float]] = _NOTHING
-    export_lead_s: float = 0.0
 
     def __init_subclass__(cls) -> None:
         cls.name = cls.__name__
@@ -363,14 +367,6 @@ class RecordedRobot(ABC):
     def doubts(self, outputs: Mapping[str, PyTree]) -> list[str]:
         """Return sentences on positions of a log that the model cannot have; default: none."""
         return []
-
-    def identified_mjcf(self, values: Mapping[str, Scalar]) -> str | None:
-        """See ``RobotModel``."""
-        return None
-
-    def plain_simulation(self, values: Mapping[str, float]) -> PlainSimulation | None:
-        """See ``RobotModel``."""
-        return None
 
 
 class Robot(RecordedRobot):

@@ -18,7 +18,7 @@ def parsed(text):
     """Return what the command line makes of a printed command: the pipeline, and its flags."""
     program, stage, pipeline, *rest = shlex.split(text)
     assert (program, stage) == ("sim2real", "identify")
-    return pipeline, flags.parse(StageFlags(ARM.defaults.identify), rest, "sim2real identify", "")
+    return pipeline, flags.parse(StageFlags(ARM.defaults.identify), rest, "sim2real identify")
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """The verdict on a deployment: which finding decides, and the command that follows."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from sim2real.artifacts.deployment import Advice, Changed, Deployment, Drift, Gap, Replay, Scores
+from sim2real.artifacts.identification import Noise, Prediction
 from sim2real.artifacts.recording import Recording
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode, Steps
@@ -192,3 +194,17 @@ def test_the_verdict_is_in_the_artifact(tmp_path):
 
     found = read_json(tmp_path / "result.json", Deployment)
     assert (found.advice, found.drift, found.replay) == (told.advice, told.drift, told.replay)
+
+
+@pytest.mark.parametrize(("errors", "limit"), [([0.1] * 16, 0.1), ([0.1] * 14 + [math.nan, None], math.inf)])
+def test_a_prediction_that_diverges_is_infinitely_wrong(monkeypatch, errors, limit):
+    left = iter(errors)
+    monkeypatch.setattr(replay.prediction, "samples", lambda *_: {})
+    monkeypatch.setattr(
+        replay.prediction, "errors", lambda *_: [Prediction("identified", 1.0, True, {"th": next(left)})]
+    )
+    problem = SimpleNamespace(ts=np.zeros((1, 3)), segments=1, readings={"th": np.zeros((1, 3))})
+    problem.with_readings = lambda readings: problem
+    noise = (Noise("th", "rad", 0.01, 0.0, 0.0),)
+    found = replay._of_noise(problem, {"th_identified": np.zeros(3)}, noise, {}, 0.3, 1.0)
+    assert found == {"th": pytest.approx(limit)}

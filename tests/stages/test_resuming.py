@@ -70,7 +70,7 @@ def settings(own, target, **changes):
     words = [*TINY[2:], "--resume", str(target)]
     words += [word for name, value in changes.items() for word in (f"--{name}", value)]
     config = defaults_of("pendulum").train
-    return flags.parse(config, words, "", "")
+    return flags.parse(config, words, "")
 
 
 @pytest.mark.night

@@ -16,7 +16,7 @@ from sim2real.graph.episode import StepRecord
 from sim2real.hardware.safety.following import Following
 from sim2real.log.writer import McapRecorder
 from sim2real.policy.contract import PolicyContract
-from sim2real.policy.runner import BlendedRunner, UprightRunner
+from sim2real.policy.runner import BlendedRunner, Runner, UprightRunner
 from sim2real.robots.loop import ACTUATOR, SENSOR
 from sim2real.robots.probe import Probe, StepAnswers, Witness, measure_delay
 from sim2real.robots.robot import Robot
@@ -25,8 +25,6 @@ from sim2real.stages.live import live_view, scene_of
 from sim2real.stages.session.episode import Bench, opened
 from sim2real.stages.terminal.console import note
 from sim2real.types import Json
-
-PolicyRunner = BlendedRunner | UprightRunner
 
 
 def run_episodes(
@@ -45,7 +43,10 @@ def run_episodes(
     Raises:
         Sim2RealError: The cause that stopped the robot.
     """
-    policy, folder = _policy_runner(bundle, robot, config), logs[0].parent
+    policy: Runner = BlendedRunner(bundle.runner(config.backend), config.blend_s)
+    if config.max_tilt_rad is not None and robot.agent.tilt_rad is not None:
+        policy = UprightRunner(policy, robot.agent.tilt_rad, config.max_tilt_rad)
+    folder = logs[0].parent
     scene = partial(scene_of, robot)
     with live_view(config.view, folder, robot.name, scene), opened(robot, config, folder / TRUTH) as bench:
         if config.hold and bench.rig.gate.config.stale != "hold":
@@ -69,13 +70,6 @@ def _announce_following(following: Following | None) -> None:
     note(f"a joint that is more than {most} off its commands stops the robot, by {following.source}")
 
 
-def _policy_runner(bundle: Bundle, robot: Robot, config: DeployConfig) -> PolicyRunner:
-    """Return the policy's runner. Its actions grow during ``blend_s``, and a limit of the tilt stops the robot."""
-    blended = BlendedRunner(bundle.runner(config.backend), config.blend_s)
-    tilt_rad, limit_rad = robot.agent.tilt_rad, config.max_tilt_rad
-    return blended if limit_rad is None or tilt_rad is None else UprightRunner(blended, tilt_rad, limit_rad)
-
-
 def _measure_delay(bench: Bench, contract: PolicyContract, folder: Path) -> dict[str, str]:
     """Bring the robot to rest, measure its delay with small steps and log them; return a line of the summary."""
     config, drive = bench.config, bench.robot.drive
@@ -90,7 +84,7 @@ def _measure_delay(bench: Bench, contract: PolicyContract, folder: Path) -> dict
         _write_probe(folder / PROBE, bench.robot, witness)
 
 
-def _run_one(bench: Bench, policy: PolicyRunner, trial: int, log: Path) -> dict[str, Json]:
+def _run_one(bench: Bench, policy: Runner, trial: int, log: Path) -> dict[str, Json]:
     """Run one episode; return the summary of its session."""
     config = bench.config
     length = f"{config.duration_s:g} s on {config.port}"
@@ -166,22 +160,20 @@ def _write_probe(log: Path, robot: Robot, witness: Witness) -> None:
     if not witness.measured or not witness.sent:
         return
     # Select the measurements and commands at the robot's rate; a command that changes is always selected.
-    sensor, actuator = SENSOR, ACTUATOR
     period_ns, start_ns = round(1e9 / robot.rate_hz), min(witness.measured[0][0], witness.sent[0][0])
     measured = _apart([begin_ns for begin_ns, *_ in witness.measured], period_ns)
     changed = [i == 0 or not np.array_equal(goal, witness.sent[i - 1][2]) for i, (*_, goal) in enumerate(witness.sent)]
     sent = _apart([begin_ns for begin_ns, *_ in witness.sent], period_ns, changed)
     # Write them as steps of the sensor and the actuator.
-    outputs = {sensor: robot.sensor.at_rest, actuator: robot.drive.message(np.zeros(len(robot.agent.action)))}
+    outputs = {SENSOR: robot.sensor.at_rest, ACTUATOR: robot.drive.message(np.zeros(len(robot.agent.action)))}
     graph = {n: {"rate_hz": robot.rate_hz, "delay_s": 0.0, "inputs": {}} for n in outputs}
     metadata = {"pipeline": robot.name, "dry_run": False, "graph": graph, "probe": True}
-    joints, units = {sensor: robot.sensor.joints}, dict.fromkeys(outputs, robot.units)
+    joints, units = {SENSOR: robot.sensor.joints}, dict.fromkeys(outputs, robot.units)
     recorder = McapRecorder(log, metadata, {}, outputs, [], joints, units)
     recorder.start(0, start_ns)
-    rows = [
-        (sensor, k, *witness.measured[i][:2], robot.sensor.read(witness.measured[i][2])) for k, i in enumerate(measured)
-    ]
-    rows += [(actuator, k, *witness.sent[i][:2], robot.drive.message(witness.sent[i][2])) for k, i in enumerate(sent)]
+    read, message = robot.sensor.read, robot.drive.message
+    rows = [(SENSOR, k, *witness.measured[i][:2], read(witness.measured[i][2])) for k, i in enumerate(measured)]
+    rows += [(ACTUATOR, k, *witness.sent[i][:2], message(witness.sent[i][2])) for k, i in enumerate(sent)]
     for node, seq, *times_ns, output in rows:
         begin, end = ((t_ns - start_ns) // 1000 for t_ns in times_ns)
         recorder.step(StepRecord(node, seq, begin, begin, begin, -1, end, 0), output)

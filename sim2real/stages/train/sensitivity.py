@@ -75,41 +75,31 @@ def moves_of(identification: Identification) -> list[Move]:
     Parameters without interval do not move.
     """
     posterior = identification.posterior
-    if posterior is None:
-        return []
     moves = []
-    for p in identification.parameters:
-        along = np.isin(posterior.names, [p.name]).astype(float)
-        if p.low95 is None or p.high95 is None or p.kind == "measurement" or not along.any():
+    for p in identification.parameters if posterior is not None else ():
+        if p.low95 is None or p.high95 is None or p.kind == "measurement" or p.name not in posterior.names:
             continue
         if (half := (p.high95 - p.low95) / 2) <= 0.0:
             continue
-        models = tuple(_most_likely(posterior, along, p.estimate, float(multiple * half)) for multiple in MULTIPLES)
-        values = np.array([sum(v for v, one in zip(m.values(), along, strict=True) if one) for m in models])
+        models = tuple(_most_likely(posterior, p.name, p.estimate, float(multiple * half)) for multiple in MULTIPLES)
+        values = np.array([model[p.name] for model in models])
         name = ROUND_TRIP if p.name in DELAYS else p.name  # the other side's delay is held
         moves.append(Move(name, p.unit, p.estimate, half, values, models))
     return moves
 
 
-def _most_likely(posterior: Posterior, along: np.ndarray, estimate: float, by: float) -> dict[str, float]:
-    """Return the most likely parameters, given that one of them, or the sum of several, has moved.
-
-    Args:
-        along: Shape ``(P,)``: 1 for the moved parameters, else 0; several move their sum, on a linear scale.
-        estimate: The value before the move [its unit].
-        by: The length of the move [its unit].
-    """
+def _most_likely(posterior: Posterior, name: str, estimate: float, by: float) -> dict[str, float]:
+    """Return the most likely parameters, given that one of them has moved from its estimate by a length [its unit]."""
     # The move on the scale of the posterior, within the bounds.
-    moved = np.flatnonzero(along)
-    kind = posterior.transform[moved[0]]
-    low, high = (sum(float(from_scale(kind, bound[i])) for i in moved) for bound in (posterior.low, posterior.high))
+    moved = posterior.names.index(name)
+    kind = posterior.transform[moved]
+    low, high = (float(from_scale(kind, bound[moved])) for bound in (posterior.low, posterior.high))
     to_scale = TRANSFORMS[kind][0]
     step = to_scale(np.clip(estimate + by, low, high)) - to_scale(estimate)
 
     # The others follow by regression on the moved one; all stop where the first reaches its bound.
-    spread = posterior.covariance @ along
-    variance = float(along @ spread)
-    shift = (spread / variance if variance > 0.0 else along) * step
+    spread = posterior.covariance[moved]
+    shift = step * (spread / spread[moved] if spread[moved] > 0.0 else np.eye(len(spread))[moved])
     room = np.where(shift > 0, posterior.high, posterior.low) - posterior.mean
     share = np.min(np.divide(room, shift, out=np.ones_like(shift), where=shift != 0.0), initial=1.0)
     x = np.clip(posterior.mean + max(share, 0.0) * shift, posterior.low, posterior.high)
@@ -120,6 +110,10 @@ def models_of(values: Mapping[str, float], moves: Sequence[Move]) -> list[dict[s
     """Return the parameters of each model: the estimates, then each move at each of its values."""
     models = ({n: v for n, v in model.items() if n in values} for m in moves for model in m.models)
     return [dict(values), *({**values, **model} for model in models)]
+
+
+def _round_trip(values: Mapping[str, float]) -> float:
+    return sum(values[name] for name in DELAYS)
 
 
 def with_room(robot: Robot, models: Sequence[Mapping[str, float]]) -> Robot:
@@ -133,10 +127,6 @@ def with_room(robot: Robot, models: Sequence[Mapping[str, float]]) -> Robot:
     wide = copy.copy(robot)
     wide.delay_spread_s = max(robot.delay_spread_s, *(abs(_round_trip(m) - _round_trip(models[0])) for m in models))
     return wide
-
-
-def _round_trip(values: Mapping[str, float]) -> float:
-    return sum(values[name] for name in DELAYS)
 
 
 def _for_one_graph(robot: Robot, models: Sequence[Mapping[str, float]]) -> list[dict[str, float]]:
