@@ -85,7 +85,8 @@ def import_files(command: str, arguments: list[str]) -> None:
     from sim2real.stages.import_logs.config import ImportConfig
 
     examples = ("import run.csv --mjcf robot.xml", "import DATASET --like so101", "info LOG")
-    _imported("import_logs").run(flags.parse(ImportConfig(), arguments, f"sim2real {command}", *examples))
+    config = flags.parse(ImportConfig(), arguments, f"sim2real {command}", *examples)
+    _imported("import_logs").run(config)
 
 
 def run_stage(

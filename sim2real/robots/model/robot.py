@@ -269,8 +269,8 @@ class MjcfRobot(LoggedRobot):
             most = np.asarray(world.model.jnt_actfrcrange)[loop.joints, 1].tolist()
             limits = [m if m < NO_LIMIT else None for m in most] if "torque" in named else self._limits
             gains = (np.asarray(rows, np.float64).tolist() for rows in (world.kp, world.kd, world.gain))
-            for joint, limit, *drive in zip(config.joints, limits, *gains, strict=True):
-                set_drive(spec, joint, control, *drive, limit)
+            for joint, limit, kp, kd, gain in zip(config.joints, limits, *gains, strict=True):
+                set_drive(spec, joint, control, kp, kd, gain, limit)
         # Copy what is identified of joints and bodies.
         model = spec.compile()
         dofs = np.array([model.joint(name).dofadr[0] for name in config.joints])
@@ -337,8 +337,8 @@ class IdentifiableMjcf(IdentifiableRecording):
         command = first[ACTUATOR]
         return {**params, "world": self._world.holding(params["world"], command)}
 
-    def driven(self, values: Mapping[str, Scalar]) -> DriveParams:
-        """Return the world's parameters with values in their places."""
+    def driven(self, values: Mapping[str, Scalar]) -> PyTree:
+        """Return the world's ``DriveParams`` with values in their places."""
         return place(self._placed, values, self._params["world"], self.joints, self.dofs)
 
     def params(self, values: Mapping[str, Scalar], start: PyTree) -> dict[str, PyTree]:

@@ -74,9 +74,10 @@ def moves_of(identification: Identification) -> list[Move]:
     alone would break every policy, in models that contradict the recording. A move ends at a parameter's bound.
     Parameters without interval do not move.
     """
-    posterior = identification.posterior
+    if (posterior := identification.posterior) is None:
+        return []
     moves = []
-    for p in identification.parameters if posterior is not None else ():
+    for p in identification.parameters:
         if p.low95 is None or p.high95 is None or p.kind == "measurement" or p.name not in posterior.names:
             continue
         if (half := (p.high95 - p.low95) / 2) <= 0.0:
