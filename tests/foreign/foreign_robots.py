@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sim2real.log.importing.importer import import_table
-from sim2real.log.importing.propose import propose
+from sim2real.log.importing.propose import ImportHints, propose
 from sim2real.log.importing.readers import open_tables
-from sim2real.log.importing.signals import ImportHints
 
 KINDS = ("sine", "triangle", "chirp", "gait", "multisine", "jerk", "stairs")
 STYLES = {

@@ -17,9 +17,8 @@ from sim2real.errors import UsageError
 from sim2real.log import McapRecorder, read_log
 from sim2real.log.importing.bags import is_ours
 from sim2real.log.importing.importer import import_table
-from sim2real.log.importing.propose import propose
+from sim2real.log.importing.propose import ImportHints, propose
 from sim2real.log.importing.readers import open_tables
-from sim2real.log.importing.signals import ImportHints
 
 SET_S = 402_500_000
 IDENTITY = lambda k, ns: ns  # noqa: E731

@@ -14,9 +14,8 @@ from sim2real.errors import UsageError
 from sim2real.log import read_log
 from sim2real.log.importing.importer import import_table
 from sim2real.log.importing.lerobot import conversion
-from sim2real.log.importing.propose import propose
+from sim2real.log.importing.propose import ImportHints, propose
 from sim2real.log.importing.readers import open_tables
-from sim2real.log.importing.signals import ImportHints
 from sim2real.stages.load import load_robot
 from sim2real.stages.train.bundle import has_readings
 

@@ -11,9 +11,8 @@ from sim2real.errors import UsageError
 from sim2real.log import load_mapping, read_log
 from sim2real.log.importing.importer import import_table
 from sim2real.log.importing.names import columns_of, is_unit, meaning
-from sim2real.log.importing.propose import propose
+from sim2real.log.importing.propose import ImportHints, propose
 from sim2real.log.importing.readers import joined, open_tables
-from sim2real.log.importing.signals import ImportHints
 
 T, GOAL, Q = motion(10.0)
 

@@ -8,9 +8,8 @@ from foreign_robots import KINDS, draw, faults, save
 from sim2real.errors import UsageError
 from sim2real.log.importing import checks
 from sim2real.log.importing.importer import import_table
-from sim2real.log.importing.propose import propose
+from sim2real.log.importing.propose import ImportHints, propose
 from sim2real.log.importing.readers import open_tables
-from sim2real.log.importing.signals import ImportHints
 
 
 def answered(log, mapping, questions):

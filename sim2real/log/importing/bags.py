@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,6 @@ from sim2real.log.session import SESSION
 _ZSTD = b"\x28\xb5\x2f\xfd"
 _IMAGES = ("Image", "PointCloud", "OccupancyGrid", "TFMessage", "CameraInfo", "LaserScan", "Marker")
 _MAX_ENTRIES = 1000
-_NAMES = ("name", "names", "joint_names")
 
 
 def is_ours(path: Path) -> bool:
@@ -50,8 +49,15 @@ def read_bag(path: Path) -> Table:
     topics: dict[str, _Topic] = {}
     table = Table(path if path.is_file() else files[0], "mcap", beside=tuple(files[1:]) if path.is_dir() else ())
     for file in files:
-        for topic, schema, message, log_ns, encoding in _messages(file, table):
-            topics.setdefault(topic, _Topic(topic, schema, encoding)).take(message, log_ns, file)
+        for channel, schema, message in _messages(file, table):
+            if channel.message_encoding == "cdr" and message.data[:4] == _ZSTD:
+                raise UsageError(
+                    f"each message of {file} is compressed by zstd, which import does not read",
+                    hint="convert it: ros2 bag convert -i BAG -o out.yaml, with compression_mode: '' in out.yaml",
+                )
+            if channel.topic not in topics:
+                topics[channel.topic] = _Topic(channel.topic, schema, channel.message_encoding, file)
+            topics[channel.topic].take(message.data, message.log_time)
     for topic in topics.values():
         topic.add_to(table)
     if not table.columns:
@@ -74,87 +80,70 @@ def _files(path: Path) -> list[Path]:
     return files
 
 
-def _messages(path: Path, table: Table) -> Iterator[tuple[str, Schema | None, bytes, int, str]]:
-    """Yield topic, schema, data, log time [ns] and encoding of the messages of a file, up to where it is cut."""
+def _messages(path: Path, table: Table) -> Iterator[tuple[Channel, Schema | None, Message]]:
+    """Yield the messages of a file, up to where it is cut."""
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
     count = 0
     with path.open("rb") as stream:
         refuse_container(path, stream.read(64))
         stream.seek(0)
-        try:
-            for record in StreamReader(stream).records:
-                if isinstance(record, Message) and record.channel_id in channels:
-                    channel = channels[record.channel_id]
-                    count += 1
-                    yield (
-                        channel.topic,
-                        schemas.get(channel.schema_id),
-                        record.data,
-                        record.log_time,
-                        channel.message_encoding,
-                    )
-                elif isinstance(record, Schema):
+        records = iter(StreamReader(stream).records)
+        while True:
+            try:
+                record = next(records, None)
+            except Exception as error:  # decompressors have their own exceptions, and a cut file raises any of them
+                table.notes.append(
+                    f"{path.name} is cut or damaged after {count} messages ({error}): the rest is left out"
+                )
+                return
+            match record:
+                case None:
+                    return
+                case Schema():
                     schemas[record.id] = record
-                elif isinstance(record, Channel):
+                case Channel():
                     channels[record.id] = record
-                elif isinstance(record, Metadata) and record.name == SESSION:
+                case Message() if record.channel_id in channels:
+                    count += 1
+                    channel = channels[record.channel_id]
+                    yield channel, schemas.get(channel.schema_id), record
+                case Metadata(name=name) if name == SESSION:
                     raise UsageError(
                         f"{path} is a log of sim2real, which needs no import",
                         hint=f"sim2real identify PIPELINE --log {path}",
                     )
-        except UsageError:
-            raise
-        except Exception as error:  # decompressors have their own exceptions, and a cut file raises any of them
-            table.notes.append(f"{path.name} is cut or damaged after {count} messages ({error}): the rest is left out")
 
 
 class _Topic:
     """The messages of one topic, flattened, by the set of their joints."""
 
-    def __init__(self, name: str, schema: Schema | None, encoding: str) -> None:
-        self.name, self.encoding = name, encoding
-        self.kind = "" if schema is None else schema.name
-        self.why = ""
+    def __init__(self, name: str, schema: Schema | None, encoding: str, path: Path) -> None:
+        self.name, self.why = name, ""
         self.rows: dict[tuple[str, ...], list[dict[str, Any]]] = {}
-        self._decode: Callable[[bytes], Any] | None = None
-        if any(word in self.kind for word in _IMAGES):
-            self.why = f"{self.kind} has no joints"
-            return
-        if encoding == "json":
-            self._decode = json.loads
+        self._decode: Callable[[bytes], Any] = json.loads
+        kind = "" if schema is None else schema.name
+        if any(word in kind for word in _IMAGES):
+            self.why = f"{kind} has no joints"
         elif encoding == "cdr" and schema is not None and schema.encoding == "ros2msg":
             from mcap_ros2.decoder import DecoderFactory
 
             try:
-                self._decode = DecoderFactory().decoder_for("cdr", schema)
+                self._decode = DecoderFactory().decoder_for("cdr", schema) or json.loads
             except Exception as error:  # of a definition that is incomplete
-                self.why = f"its type {self.kind} cannot be read ({error})"
+                self.why = f"its type {kind} cannot be read ({error})"
         elif encoding == "cdr":
             self.why = f"its schema is in {'' if schema is None else schema.encoding!r}, not in ros2msg"
-        else:
-            self.why = f"its messages are in {encoding}, which import does not read"
-
-    def take(self, data: bytes, log_ns: int, path: Path) -> None:
-        """Decode and flatten a message."""
-        if self.encoding == "cdr" and data[:4] == _ZSTD:
+        elif encoding != "json":
+            to_json = "convert it to JSON or CSV, such as with `mcap cat FILE --json --topics TOPIC > run.json`"
             raise UsageError(
-                f"each message of {path} is compressed by zstd, which import does not read",
-                hint="convert it: ros2 bag convert -i BAG -o out.yaml, with compression_mode: '' in out.yaml",
+                f"{name} in {path} is in {encoding}, which import does not read",
+                hint=to_json if encoding == "protobuf" else "record it in ROS 2's CDR or in JSON",
             )
-        if self.encoding not in ("cdr", "json") and not self.why.startswith("skip"):
-            raise (
-                UsageError(
-                    f"{self.name} in {path} is in {self.encoding}, which import does not read",
-                    hint="convert it to JSON or CSV, such as with `mcap cat FILE --json --topics TOPIC > run.json`",
-                )
-                if self.encoding == "protobuf"
-                else UsageError(
-                    f"{self.name} in {path} is in {self.encoding}, which import does not read",
-                    hint="record it in ROS 2's CDR or in JSON",
-                )
-            )
-        if self._decode is None or self.why:
+
+    def take(self, data: bytes, log_ns: int) -> None:
+        """Decode and flatten a message."""
+        if self.why:
             return
         row: dict[str, Any] = {}
         try:
@@ -163,49 +152,44 @@ class _Topic:
             self.why = f"a message cannot be decoded ({type(error).__name__}: {error})"
             return
         row["log_time"] = log_ns
-        names = next((row[key] for key in _NAMES if isinstance(row.get(key), list)), [])
-        self.rows.setdefault(tuple(sorted(names)), []).append(row)
+        self.rows.setdefault(tuple(sorted(_names(row))), []).append(row)
 
     def add_to(self, table: Table) -> None:
         """Add the signals of the topic to a table."""
         if self.why:
             table.notes.append(f"skipped: {self.name}: {self.why}")
             return
-        several = len(self.rows) > 1
         for n, rows in enumerate(self.rows.values(), 1):
-            topic = f"{self.name}#{n}" if several else self.name
-            if several:
-                listed = ", ".join(next((rows[0][k] for k in _NAMES if k in rows[0]), [])) or "no names"
-                table.notes.append(f"{self.name} has several senders: {topic} has {listed}")
-            self._add(table, topic, rows)
+            topic, names = self.name, _names(rows[0])
+            if len(self.rows) > 1:
+                topic = f"{self.name}#{n}"
+                table.notes.append(f"{self.name} has several senders: {topic} has {', '.join(names) or 'no names'}")
+            for key, value in rows[0].items():
+                if not isinstance(value[0] if isinstance(value, list) and value else value, str):  # frames and names
+                    _add(table, f"{topic}.{key}", key, rows, names)
 
-    def _add(self, table: Table, topic: str, rows: list[dict[str, Any]]) -> None:
-        first = rows[0]
-        key_of_names = next((k for k in _NAMES if isinstance(first.get(k), list)), None)
-        names: list[str] = first[key_of_names] if key_of_names else []
-        moved = any(row.get(key_of_names) != names for row in rows) if key_of_names else False
-        for key, value in first.items():
-            values = [row.get(key) for row in rows]
-            if isinstance(value, str) or (isinstance(value, list) and value and isinstance(value[0], str)):
-                continue  # frames and names
-            if isinstance(value, list):
-                lengths = {len(v) if isinstance(v, list) else -1 for v in values}
-                if lengths == {0}:
-                    continue
-                if len(lengths) > 1 or -1 in lengths:
-                    table.broken[f"{topic}.{key}"] = "its length differs between messages"
-                    continue
-                if len(value) > _MAX_ENTRIES:
-                    table.notes.append(f"skipped: {topic}.{key} has {len(value)} entries")
-                    continue
-                if moved and key_of_names and len(value) == len(names):
-                    values = [_sorted(v, row[key_of_names], names) for v, row in zip(values, rows, strict=True)]
-            elif any(v is None or isinstance(v, list) for v in values):
-                table.broken[f"{topic}.{key}"] = "some messages lack it"
-                continue
-            table.add(f"{topic}.{key}", values)
-            if isinstance(value, list) and len(value) == len(names):
-                table.names[f"{topic}.{key}"] = list(names)
+
+def _names(row: Mapping[str, Any]) -> list[str]:
+    """Return the names of the joints of a flattened message."""
+    return next((row[key] for key in ("name", "names", "joint_names") if isinstance(row.get(key), list)), [])
+
+
+def _add(table: Table, name: str, key: str, rows: Sequence[Mapping[str, Any]], names: list[str]) -> None:
+    """Add one field of all messages; entries of joints are in the order of the first message."""
+    values = [row.get(key) for row in rows]
+    lengths = {len(v) if isinstance(v, list) else None for v in values}
+    if lengths == {0}:
+        return
+    if None in values or len(lengths) > 1:
+        table.broken[name] = "its length differs between messages" if len(lengths) > 1 else "some messages lack it"
+    elif (count := lengths.pop()) is not None and count > _MAX_ENTRIES:
+        table.notes.append(f"skipped: {name} has {count} entries")
+    else:
+        if count == len(names) > 0:
+            table.names[name] = list(names)
+            if any(_names(row) != names for row in rows):
+                values = [_sorted(v, _names(row), names) for v, row in zip(values, rows, strict=True)]
+        table.add(name, values)
 
 
 def _sorted(values: Any, own: list[str], names: list[str]) -> list[Any]:

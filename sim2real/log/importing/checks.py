@@ -6,9 +6,9 @@ Goals and measured positions in one unit are compared joint by joint: order, sig
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -22,18 +22,20 @@ TURN_RAD = 2.0 * np.pi
 _MAX_ROWS = 6000
 """Compared rows; a longer recording is thinned."""
 _FINER = 4
-"""Compared rows for each sample."""
+"""Compared rows for each sample, as a fast tone turns its sign within two samples."""
 _LAGS_S = (-0.3, 0.6)
 _FOLLOWS_R = 0.8
 """A position follows a command from this correlation on."""
-_SLOPES = (0.5, 1.6)
-"""A servo follows its goal with such a slope; another one means another unit or scale."""
 _STILL = 2e-3
 """A joint with a smaller standard deviation does not move [rad or m]."""
 _MOST_STEPS = 4
 """A zero that moves more often is no zero."""
 _FASTEST_RAD_S = 60.0
 """Highest speed of a joint; a faster step is no motion."""
+
+Weight = Literal["refuse", "ask", "warn", "note"]
+"""``refuse``: data and mapping contradict each other; ``ask``: the data fit several mappings; ``warn``: true, and to be
+known; ``note``: evidence."""
 
 
 @dataclass(frozen=True)
@@ -44,93 +46,118 @@ class Finding:
         kind: ``order``, ``sign``, ``slope``, ``lag``, ``copy``, ``clock``, ``zero``, ``rate``, ``scale``, ``still`` or
             ``follows``.
         joint: Number of the joint; -1 for all.
-        weight: ``refuse``: data and mapping contradict each other; ``ask``: the data fit several mappings;
-            ``warn``: true, and to be known; ``note``: evidence.
     """
 
     kind: str
     joint: int
     text: str
-    weight: Literal["refuse", "ask", "warn", "note"]
+    weight: Weight
 
 
 @dataclass(frozen=True)
-class Response:
-    """How positions follow commands at each lag.
+class JointMeasures:
+    """How one joint follows its own goal, and the goals of other joints."""
 
-    Attributes:
-        lag_s: Shape ``(L,)`` [s].
-        r: Shape ``(L, joints, commands)``: correlation.
-        slope: Shape ``(L, joints, commands)``: of positions over commands.
-        misfit: Shape ``(2, L, joints, commands)``: error of the command, and of its opposite, over the spread.
-        moves: Shape ``(joints,)``: whether position and command of the same number move.
-        period_s: Time between samples of the faster side [s].
-    """
+    name: str
+    copied: bool  # its goals are copies of its measurements
+    moves: bool  # goal and position move
+    goal: float  # level of a goal that is held; NaN of one that moves
+    level: float  # of the position
+    r: float = 0.0  # correlation with the goal, at the best lag after it
+    slope: float = 1.0  # of the position over the goal at this lag
+    misfit: float = 0.0  # error of the goal as a prediction, over the spread of the position
+    against: float = 0.0  # correlation with the opposite of the goal, negative
+    mirror: float = 0.0  # error of the opposite goal as a prediction
+    lag_s: float = 0.0
+    lead_r: float = 0.0  # correlation at the best lag of all, also before the goal
+    lead_s: float = 0.0  # by how much it moves before its goal at that lag
+    sample_s: float = 0.0
+    other: str = ""  # the other joint whose goal it follows best
+    other_r: float = 0.0
+    rival: int = -1  # a column whose goal it follows as well as its own; -1 without any
+    rival_r: float = 0.0
 
-    lag_s: np.ndarray
-    r: np.ndarray
-    slope: np.ndarray
-    misfit: np.ndarray
-    moves: np.ndarray
-    period_s: float
+    @property
+    def best(self) -> float:
+        """The larger correlation with the goal or its opposite."""
+        return max(self.r, -self.against)
 
-    def best(
-        self, joint: int, command: int, sign: float, begin_s: float | None = None
-    ) -> tuple[float, float, float, float]:
-        """Return correlation, lag [s], slope and misfit of the best lag with a sign of the correlation."""
-        rows = np.flatnonzero(self.lag_s >= (-1.5 * self.period_s if begin_s is None else begin_s))
-        k = rows[np.argmax(sign * self.r[rows, joint, command])]
-        misfit = float(self.misfit[0 if sign > 0 else 1, rows, joint, command].min())
-        return float(self.r[k, joint, command]), float(self.lag_s[k]), float(self.slope[k, joint, command]), misfit
+    @property
+    def is_held_elsewhere(self) -> bool:
+        """Whether it is held far from its goal: a weak servo sags, by less."""
+        return not self.moves and abs(self.goal) > 0.1 and abs(self.level - self.goal) > 0.5 * abs(self.goal)
+
+    @property
+    def sign(self) -> int:
+        """The sign with which it follows its goal; 0: either (a tone half a period later is its opposite)."""
+        plus = _is_clear(self.r, -self.against, self.misfit, self.mirror)
+        minus = _is_clear(-self.against, self.r, self.mirror, self.misfit)
+        return plus - minus
+
+    @property
+    def leads(self) -> bool:
+        """Whether it moves before its goal, and follows it clearly worse."""
+        if self.best < _FOLLOWS_R:
+            return self.lead_r > 0.9
+        return self.lead_s > 1.5 * self.sample_s and 1 - self.r > 3 * (1 - self.lead_r) + 0.005
 
 
-def respond(
-    t_s: tuple[np.ndarray, np.ndarray], command: np.ndarray, position: np.ndarray, acting: np.ndarray | None = None
-) -> Response | None:
-    """Compare commands and positions on one grid of time; None if they overlap in fewer than 50 samples.
+def _is_clear(r: float, other_r: float, misfit: float, other_misfit: float) -> bool:
+    """Return whether a goal fits clearly better than another one: by its shape, or by its level."""
+    by_level = misfit < 0.5 * other_misfit and other_misfit > 0.1
+    return 1 - other_r > 3 * (1 - r) + 0.02 or (by_level and r > _FOLLOWS_R)
 
-    Args:
-        t_s: Stamps of commands ``(N,)`` and of positions ``(M,)`` [s].
-        command: Shape ``(N, commands)``.
-        position: Shape ``(M, joints)``.
-        acting: Shape ``(N,)``: whether commands act; None: all do.
-    """
-    # Finer than the samples, as a fast tone turns its sign within two of them.
-    grid, held, joined, live = _on_grid(t_s, command, position, acting, _FINER)
-    if len(grid) < 2 or live.sum() * (grid[1] - grid[0]) < 50 * (
-        sample_s := min(float(np.median(np.diff(t))) for t in t_s)
-    ):
-        return None
-    period_s = float(grid[1] - grid[0])
-    lags = np.arange(round(_LAGS_S[0] / period_s), round(_LAGS_S[1] / period_s) + 1)
-    least = round(50 * sample_s / period_s)
-    lags = lags[np.abs(lags) < len(grid) - least]
-    # At a lag, sum over the rows at which both the command then and the position now are known: by FFT, for all lags.
-    centre = [x[live].mean(axis=0) for x in (held, joined)]  # for the precision of the sums
-    c, q = (np.where(live[:, None], x - m, 0.0) for x, m in zip((held, joined), centre, strict=True))
-    size = 1 << (2 * len(grid) - 1).bit_length()
-    ones, x, xx, y, yy = (np.fft.rfft(v, size, axis=0) for v in (live[:, None].astype(float), c, c * c, q, q * q))
 
-    def sums(now: np.ndarray, then: np.ndarray) -> np.ndarray:
-        return np.fft.irfft(now * np.conj(then), size, axis=0)[lags]
+class _Check(NamedTuple):
+    kind: str
+    weight: Weight
+    holds: Callable[[JointMeasures], bool]
+    text: str
 
-    count = np.maximum(sums(ones, ones), 1.0)
-    mx, vx = sums(ones, x) / count, sums(ones, xx) / count
-    my, vy = sums(y, ones) / count, sums(yy, ones) / count
-    vx, vy = np.maximum(vx - mx**2, 1e-18), np.maximum(vy - my**2, 1e-18)
-    both = np.stack([sums(y[:, j : j + 1], x) for j in range(q.shape[1])], axis=1)
-    cov = both / count[:, :, None] - my[:, :, None] * mx[:, None, :]
-    slope = cov / vx[:, None, :]
-    r = cov / np.sqrt(vx[:, None, :] * vy[:, :, None])
-    r[count[:, 0] < least] = 0.0
-    level = [(my + centre[1])[:, :, None] - sign * (mx + centre[0])[:, None, :] for sign in (1.0, -1.0)]
-    square = [
-        vy[:, :, None] + vx[:, None, :] - 2 * sign * cov + at**2 for sign, at in zip((1.0, -1.0), level, strict=True)
-    ]
-    misfit = np.sqrt(np.maximum(np.stack(square), 0.0) / vy[:, :, None])
-    both = min(q.shape[1], c.shape[1])
-    moves = (q[live].std(axis=0) > _STILL)[:both] & (c[live].std(axis=0) > _STILL)[:both]
-    return Response(lags * period_s, r, slope, misfit, moves, sample_s)
+
+_LEVEL = "{m.name} is held at {m.level:.3g} by a goal of {m.goal:.3g}: another sign, unit or zero"
+_SLOPE = "{m.name} follows its goal (r {m.r:.2f}) with a slope of {m.slope:.3g}: unit or scale of one of them is wrong"
+_LEADS = "{m.name} moves {m.lead_s:.3g} s before its goal: names are exchanged, or the clocks do not agree"
+JOINT_CHECKS = (
+    _Check("copy", "refuse", lambda m: m.copied,
+           "{m.name}: its goals are copies of its measurements, so they hold no information on the drive"),
+    _Check("sign", "ask", lambda m: m.is_held_elsewhere and abs(m.level + m.goal) < 0.3 * abs(m.goal), _LEVEL),
+    _Check("slope", "ask", lambda m: m.is_held_elsewhere, _LEVEL),
+    _Check("still", "warn", lambda m: not m.moves, "{m.name} hardly moves: sign, order and unit are not checked"),
+    _Check("order", "refuse", lambda m: m.other_r > 0.9 and m.best < 0.6,
+           "{m.name} follows the goal of {m.other} (r {m.other_r:.2f}), not its own (r {m.best:.2f})"),
+    _Check("order", "ask", lambda m: m.rival >= 0,
+           "{m.name} follows its own goal and that of column {m.rival} alike (r {m.best:.2f} and {m.rival_r:.2f})"),
+    _Check("lag", "refuse", lambda m: m.best < _FOLLOWS_R and m.leads, _LEADS),
+    _Check("follows", "warn", lambda m: m.best < _FOLLOWS_R,
+           "{m.name} does not follow its goal (r {m.best:.2f} at most): sign, unit and order are not checked"),
+    _Check("sign", "refuse", lambda m: m.sign < 0,
+           "{m.name} moves against its goal (r {m.against:.2f}): a sign of scale is wrong"),
+    # A weak servo stays far behind its goal, but no servo goes far beyond it.
+    _Check("slope", "refuse", lambda m: m.sign > 0 and not 0.15 < m.slope < 4.0, _SLOPE),
+    _Check("slope", "ask", lambda m: m.sign > 0 and not 0.5 < m.slope < 1.6, _SLOPE),
+    _Check("lag", "refuse", lambda m: m.leads, _LEADS),
+    _Check("sign", "ask", lambda m: m.sign == 0,
+           "{m.name} fits its goal with either sign (r {m.r:.2f} and {m.against:.2f}): the motion repeats"),
+)  # fmt: skip
+"""What the measures of a joint show: the first check that holds counts; none holds of a joint that follows its goal."""
+
+_HINTS = {
+    "sign": "change the sign of that joint's scale, such as scale = [1, -1]",
+    "order": "list the sources in the order of the positions",
+    "copy": "log the commands that were sent, not the measurements",
+    "clock": "stamp both streams with one clock, such as a recorder's",
+    "zero": "cut the file where the zero moves: --samples A:B",
+    "scale": "name the other joints with --joints, or give the column its own scale in a mapping",
+    "slope": "correct the unit, or name the other joints with --joints",
+    "lag": "exchange the names, or correct stamp_offset",
+}
+
+
+def hint_for(findings: Sequence[Finding]) -> str:
+    """Return what to do about findings that refuse an import."""
+    hints = dict.fromkeys(_HINTS.get(f.kind, "correct the mapping") for f in findings)
+    return "; ".join(hints) + "; --as-told imports it all the same"
 
 
 def check(
@@ -153,40 +180,36 @@ def check(
     """
     found = respond(t_s, goal, position, acting)
     if found is None:
-        return [
-            Finding("still", -1, "goals and positions overlap in fewer than 50 samples: nothing is checked", "refuse")
-        ]
-    findings: list[Finding] = []
-    moving = np.flatnonzero(found.moves)
+        text = "goals and positions overlap in fewer than 50 samples: nothing is checked"
+        return [Finding("still", -1, text, "refuse")]
     copies = copied(*t_s, goal, position)
-    lags: dict[int, float] = {}
-    for i in range(len(names)):
-        if copies[i]:
-            text = f"{names[i]}: its goals are copies of its measurements, so they hold no information on the drive"
-            findings.append(Finding("copy", i, text, "refuse"))
-        elif i not in moving:
-            findings.append(_held(i, names[i], goal[:, i], position[:, i]))
+    measures = [_measure(found, i, names, by_name, bool(copies[i]), goal, position) for i in range(len(names))]
+    findings: list[Finding] = []
+    following: list[int] = []
+    for i, m in enumerate(measures):
+        held = next((c for c in JOINT_CHECKS if c.holds(m)), None)
+        if held is None:
+            following.append(i)
         else:
-            own, lag_s = _own(found, i, names, by_name)
-            findings += own
-            if lag_s is not None:
-                lags[i] = lag_s
-    following = [i for i in lags if not copies[i]]
-    clock = _clock(t_s, goal, position, following or moving.tolist(), acting)
+            findings.append(Finding(held.kind, i, held.text.format(m=m), held.weight))
+    moving = [i for i, m in enumerate(measures) if m.moves]
+    clock = _clock(t_s, goal, position, following or moving, acting)
     if any(f.weight == "refuse" for f in clock):
         findings = [f for f in findings if f.kind not in ("follows", "lag")]
-    elif moving.size and not lags and not any(f.weight in ("refuse", "ask") for f in findings):
+    elif moving and not following and not any(f.weight in ("refuse", "ask") for f in findings):
         text = "no position follows its goal: units, signs, order and clocks are unproven"
         findings.append(Finding("follows", -1, text, "ask"))
     findings += clock
     if following:
-        late = ", ".join(f"{names[i]} {1e3 * lags[i]:.0f} ms" for i in following[:6])
+        late = ", ".join(f"{names[i]} {1e3 * measures[i].lag_s:.0f} ms" for i in following[:6])
         text = f"positions follow their goals: {late}" + " ..." * (len(following) > 6)
         findings.append(Finding("follows", -1, text, "note"))
-    for i in moving.tolist() if not any(f.weight == "refuse" for f in findings) else ():
-        findings += _zero(t_s, goal[:, i], position[:, i], i, names[i], lags.get(i)) if not copies[i] else []
-    if moving.size:
-        findings += _rates(t_s, goal, position, moving.tolist())
+    if not any(f.weight == "refuse" for f in findings):
+        for i in moving:
+            lag_s = measures[i].lag_s if i in following else None
+            findings += _zero(t_s, goal[:, i], position[:, i], i, names[i], lag_s)
+    if moving:
+        findings += _rates(t_s, goal[:, moving], position[:, moving])
     return findings + _scales(position, names)
 
 
@@ -197,118 +220,112 @@ def check_episode(episode: Episode, joints: Sequence[str] = (), by_name: bool = 
     enabled = [values for name, values in commands.items() if meaning(name).quantity == "enabled"]
     acting = np.asarray((enabled[0].reshape(len(enabled[0]), -1) > 0).all(axis=1)) if len(enabled) == 1 else None
     findings: list[Finding] = []
-    for name, position in sensed.items():
-        for goal, values in commands.items():
-            pair = meaning(name).quantity == "position" and meaning(goal).side == "command"
-            if not (pair and meaning(goal).quantity in ("", "position") and units.get(goal) == units.get(name)):
-                continue
-            flat = values.reshape(len(values), -1), position.reshape(len(position), -1)
-            if flat[0].shape[1] == flat[1].shape[1]:
-                names = joints if len(joints) == flat[1].shape[1] else [f"joint {i}" for i in range(flat[1].shape[1])]
-                t_s = episode.steps["actuator"].begun_s, episode.steps["sensor"].begun_s
-                findings += check(t_s, *flat, names, by_name, acting)
+    for (name, position), (goal, values) in itertools.product(sensed.items(), commands.items()):
+        named = meaning(goal)
+        if meaning(name).quantity != "position" or named.side != "command" or named.quantity not in ("", "position"):
+            continue
+        flat = values.reshape(len(values), -1), position.reshape(len(position), -1)
+        if units.get(goal) == units.get(name) and flat[0].shape[1] == flat[1].shape[1]:
+            names = joints if len(joints) == flat[1].shape[1] else [f"joint {i}" for i in range(flat[1].shape[1])]
+            t_s = episode.steps["actuator"].begun_s, episode.steps["sensor"].begun_s
+            findings += check(t_s, *flat, names, by_name, acting)
     return findings
 
 
-_HINTS = {
-    "sign": "change the sign of that joint's scale, such as scale = [1, -1]",
-    "order": "list the sources in the order of the positions",
-    "copy": "log the commands that were sent, not the measurements",
-    "clock": "stamp both streams with one clock, such as a recorder's",
-    "zero": "cut the file where the zero moves: --samples A:B",
-    "scale": "name the other joints with --joints, or give the column its own scale in a mapping",
-    "slope": "correct the unit, or name the other joints with --joints",
-    "lag": "exchange the names, or correct stamp_offset",
-}
+# -- measures of goals and positions
 
 
-def hint_for(findings: Sequence[Finding]) -> str:
-    """Return what to do about findings that refuse an import."""
-    hints = dict.fromkeys(_HINTS.get(f.kind, "correct the mapping") for f in findings)
-    return "; ".join(hints) + "; --as-told imports it all the same"
+class Response(NamedTuple):
+    """How positions follow commands at each lag."""
+
+    lag_s: np.ndarray  # (L,)
+    r: np.ndarray  # (L, joints, commands): correlation
+    slope: np.ndarray  # (L, joints, commands): of positions over commands
+    mean: tuple[np.ndarray, np.ndarray]  # of commands and positions, (joints,)
+    spread: tuple[np.ndarray, np.ndarray]
+    sample_s: float  # time between samples of the faster side
+
+    def best(self, joint: int, command: int, sign: float, begin_s: float) -> tuple[float, float, float]:
+        """Return correlation, lag [s] and slope of the best lag from a begin on, with a sign of the correlation."""
+        rows = np.flatnonzero(self.lag_s >= begin_s)
+        k = rows[np.argmax(sign * self.r[rows, joint, command])]
+        return float(self.r[k, joint, command]), float(self.lag_s[k]), float(self.slope[k, joint, command])
+
+    def misfit(self, joint: int, command: int, sign: float, r: float) -> float:
+        """Return the error of a command, or of its opposite, as a prediction, over the spread of the position."""
+        size = self.spread[0][command] / self.spread[1][joint]
+        level = (self.mean[1][joint] - sign * self.mean[0][command]) / self.spread[1][joint]
+        return float(np.sqrt(max(1 + size**2 - 2 * sign * r * size, 0.0) + level**2))
 
 
-def is_rate(t_s: np.ndarray, angle: np.ndarray, velocity: np.ndarray) -> bool:
-    """Return whether velocities ``(N, joints)`` are the rate of angles, in the same unit."""
-    rows = np.isfinite(angle).all(axis=1) & np.isfinite(velocity).all(axis=1) & np.isfinite(t_s)
-    if rows.sum() < 50 or (np.diff(t_s[rows]) <= 0).any():
-        return False
-    rate = np.gradient(angle[rows], t_s[rows], axis=0)
-    rate, v = (ndimage.uniform_filter1d(x, 5, axis=0)[3:-3] for x in (rate, velocity[rows]))
-    moving = v.std(axis=0) > 1e-9
-    x, y = v[:, moving].ravel(), rate[:, moving].ravel()
-    return bool(moving.any() and np.corrcoef(x, y)[0, 1] > 0.8 and 0.8 < (x @ y) / (x @ x) < 1.25)
+def respond(
+    t_s: tuple[np.ndarray, np.ndarray], command: np.ndarray, position: np.ndarray, acting: np.ndarray | None = None
+) -> Response | None:
+    """Compare commands and positions on one grid of time; None if they overlap in fewer than 50 samples.
+
+    Args:
+        t_s: Stamps of commands ``(N,)`` and of positions ``(M,)`` [s].
+        command: Shape ``(N, joints)``.
+        position: Shape ``(M, joints)``.
+        acting: Shape ``(N,)``: whether commands act; None: all do.
+    """
+    grid, held, joined, live = _on_grid(t_s, command, position, acting, _FINER)
+    sample_s = min(float(np.median(np.diff(t))) for t in t_s)
+    if len(grid) < 2 or live.sum() * (grid[1] - grid[0]) < 50 * sample_s:
+        return None
+    period_s = float(grid[1] - grid[0])
+    lags = np.arange(round(_LAGS_S[0] / period_s), round(_LAGS_S[1] / period_s) + 1)
+    least = round(50 * sample_s / period_s)
+    lags = lags[np.abs(lags) < len(grid) - least]
+    # At a lag, sum over the rows at which both the command then and the position now are known: by FFT, for all lags.
+    mean, spread = ([f(x[live], axis=0) for x in (held, joined)] for f in (np.mean, np.std))
+    c, q = (np.where(live[:, None], x - m, 0.0) for x, m in zip((held, joined), mean, strict=True))
+    size = 1 << (2 * len(grid) - 1).bit_length()
+    ones, x, xx, y, yy = (np.fft.rfft(v, size, axis=0) for v in (live[:, None].astype(float), c, c * c, q, q * q))
+
+    def sums(now: np.ndarray, then: np.ndarray) -> np.ndarray:
+        return np.fft.irfft(now * np.conj(then), size, axis=0)[lags]
+
+    count = np.maximum(sums(ones, ones), 1.0)
+    mx, my = sums(ones, x) / count, sums(y, ones) / count
+    vx, vy = (np.maximum(v / count - m**2, 1e-18) for v, m in ((sums(ones, xx), mx), (sums(yy, ones), my)))
+    both = np.stack([sums(y[:, j : j + 1], x) for j in range(q.shape[1])], axis=1)
+    cov = both / count[:, :, None] - my[:, :, None] * mx[:, None, :]
+    r = cov / np.sqrt(vx[:, None, :] * vy[:, :, None])
+    r[count[:, 0] < least] = 0.0
+    return Response(lags * period_s, r, cov / vx[:, None, :], (mean[0], mean[1]), (spread[0], spread[1]), sample_s)
 
 
-def _own(found: Response, i: int, names: Sequence[str], by_name: bool) -> tuple[list[Finding], float | None]:
-    """Return findings on order, sign, slope and lag of a joint, and its lag [s] if it follows its own goal."""
-    name, everyone = names[i], range(found.r.shape[2])
-    r, lag_s, slope, misfit = found.best(i, i, 1.0)
-    against, _, opposite, mirror = found.best(i, i, -1.0)
-    own = max(r, -against)
-    findings: list[Finding] = []
-    others = []
-    for j in everyone:
-        if j != i and not _same(found, i, j):
-            fits = [found.best(i, j, sign) for sign in (1.0, -1.0)]
-            others.append((max(abs(f[0]) for f in fits), min(f[3] for f in fits), j))
-    better = max(others, default=(0.0, np.inf, -1))
-    if better[0] > 0.9 and own < 0.6:
-        text = f"{name} follows the goal of {names[better[2]]} (r {better[0]:.2f}), not its own (r {own:.2f})"
-        return [Finding("order", i, text, "refuse")], None
-    if not by_name and max(own, better[0]) >= _FOLLOWS_R:
-        for other, other_misfit, j in others:
-            shape = 1 - other > 3 * (1 - own) + 0.02
-            level = min(misfit, mirror) < 0.5 * other_misfit and other_misfit > 0.1
-            if not (shape or level) or (other > own + 0.02 and not level):
-                text = f"{name} follows the goals of column {i} and of column {j} alike (r {own:.2f} and {other:.2f})"
-                return [Finding("order", i, text, "ask")], None
-    # The sign: shape first, then level, as a tone that is half a period later is its opposite.
-    if own < _FOLLOWS_R:
-        lead = found.best(i, i, 1.0, _LAGS_S[0])
-        if lead[0] > 0.9:
-            text = (
-                f"{name} moves {-1e3 * lead[1]:.0f} ms before its goal: names are exchanged, or the clocks do not agree"
-            )
-            return [Finding("lag", i, text, "refuse")], None
-        text = f"{name} does not follow its goal (r {own:.2f} at most): sign, unit and order are not checked"
-        return [Finding("follows", i, text, "warn")], None
-    plus = 1 + against > 3 * (1 - r) + 0.02 or (misfit < 0.5 * mirror and mirror > 0.1 and r > _FOLLOWS_R)
-    minus = 1 - r > 3 * (1 + against) + 0.02 or (mirror < 0.5 * misfit and misfit > 0.1 and -against > _FOLLOWS_R)
-    if minus and not plus:
-        text = f"{name} moves against its goal (r {against:.2f}, slope {opposite:.3g}): a sign of scale is wrong"
-        return [Finding("sign", i, text, "refuse")], None
-    if not plus or minus:
-        text = f"{name} fits its goal with either sign (r {r:.2f} and {against:.2f}): the motion repeats"
-        findings.append(Finding("sign", i, text, "ask"))
-    if not _SLOPES[0] < slope < _SLOPES[1] and not findings:
-        # A weak servo stays far behind its goal, but no servo goes far beyond it.
-        text = f"{name} follows its goal (r {r:.2f}) with a slope of {slope:.3g}: unit or scale of one of them is wrong"
-        return [Finding("slope", i, text, "ask" if 0.15 < slope < 4.0 else "refuse")], None
-    lead = found.best(i, i, 1.0, _LAGS_S[0])
-    if lead[1] < -1.5 * found.period_s and 1 - r > 3 * (1 - lead[0]) + 0.005:
-        text = f"{name} moves {-1e3 * lead[1]:.0f} ms before its goal: names are exchanged, or the clocks do not agree"
-        return [Finding("lag", i, text, "refuse")], None
-    return findings, None if findings else lag_s
-
-
-def _same(found: Response, i: int, j: int) -> bool:
-    """Return whether two joints have the same goals, or exactly opposite ones, which another sign could exchange."""
-    same = np.abs(found.r[:, i, i] - found.r[:, i, j]).max() < 1e-6
-    level = np.abs(found.misfit[:, :, i, i] - found.misfit[:, :, i, j]).max() < 1e-6
-    opposite = np.abs(found.r[:, i, i] + found.r[:, i, j]).max() < 1e-6
-    mirrored = np.abs(found.misfit[:, :, i, i] - found.misfit[::-1, :, i, j]).max() < 1e-6
-    return bool((same and level) or (opposite and mirrored))
-
-
-def _held(i: int, name: str, goal: np.ndarray, position: np.ndarray) -> Finding:
-    """Return what the levels of a joint that is held show."""
-    g, q = float(np.median(goal)), float(np.median(position))
-    if np.ptp(goal) < 4 * _STILL and abs(g) > 0.1 and abs(q - g) > 0.5 * abs(g):
-        # A weak servo sags; an opposite or far level is another sign, zero or unit.
-        text = f"{name} is held at {q:.3g} by a goal of {g:.3g}: another sign, unit or zero"
-        return Finding("sign" if abs(q + g) < 0.3 * abs(g) else "slope", i, text, "ask")
-    return Finding("still", i, f"{name} hardly moves: sign, order and unit are not checked", "warn")
+def _measure(found: Response, i: int, names: Sequence[str], by_name: bool, copied: bool, goal: np.ndarray,
+             position: np.ndarray) -> JointMeasures:  # fmt: skip
+    """Return the measures of a joint."""
+    level, moves = float(np.median(position[:, i])), bool(min(s[i] for s in found.spread) > _STILL)
+    if copied or not moves:
+        held = float(np.median(goal[:, i])) if np.ptp(goal[:, i]) < 4 * _STILL else np.nan
+        return JointMeasures(names[i], copied, moves, held, level)
+    begin_s = -1.5 * found.sample_s
+    r, lag_s, slope = found.best(i, i, 1.0, begin_s)
+    against, *_ = found.best(i, i, -1.0, begin_s)
+    lead_r, lead_s, _ = found.best(i, i, 1.0, _LAGS_S[0])
+    misfit, mirror = found.misfit(i, i, 1.0, r), found.misfit(i, i, -1.0, against)
+    # Compare with the goals of other joints, apart from those that equal its own, or its opposite.
+    own, others, rivals = max(r, -against), [], []
+    for j in range(len(names)):
+        if j == i or any(np.allclose(goal[:, i], s * goal[:, j], 1e-6, 1e-9) for s in (1, -1)):
+            continue
+        fits = [(found.best(i, j, sign, begin_s)[0], sign) for sign in (1.0, -1.0)]
+        other_r = max(abs(r) for r, _ in fits)
+        others.append((other_r, j))
+        its = min(found.misfit(i, j, sign, r) for r, sign in fits)
+        by_level = min(misfit, mirror) < 0.5 * its and its > 0.1
+        if not by_level and (1 - other_r <= 3 * (1 - own) + 0.02 or other_r > own + 0.02):
+            rivals.append((j, other_r))
+    other_r, other = max(others, default=(0.0, i))
+    rival, rival_r = rivals[0] if rivals and not by_name and max(own, other_r) >= _FOLLOWS_R else (-1, 0.0)
+    return JointMeasures(
+        names[i], False, True, np.nan, level, r, slope, misfit, against, mirror, lag_s, lead_r, -lead_s,
+        found.sample_s, names[other], other_r, rival, rival_r,
+    )  # fmt: skip
 
 
 def _clock(
@@ -323,21 +340,20 @@ def _clock(
     count = min(10, int((end - begin) / 3.0))
     if count < 4 or not joints:
         return []
-    edges = np.linspace(begin, end, count + 1)
     middles, lags = [], []
-    for low, high in itertools.pairwise(edges.tolist()):
-        rows = [
-            np.flatnonzero((t >= a) & (t <= b)) for t, a, b in ((t_s[0], low - 1.0, high + 1.0), (t_s[1], low, high))
-        ]
-        if min(map(len, rows)) < 60:
+    for low, high in itertools.pairwise(np.linspace(begin, end, count + 1).tolist()):
+        sent = np.flatnonzero((t_s[0] >= low - 1.0) & (t_s[0] <= high + 1.0))
+        read = np.flatnonzero((t_s[1] >= low) & (t_s[1] <= high))
+        if min(len(sent), len(read)) < 60:
             continue
-        c, q = goal[rows[0]][:, joints], position[rows[1]][:, joints]
-        part = respond((t_s[0][rows[0]], t_s[1][rows[1]]), c, q, None if acting is None else acting[rows[0]])
+        c, q = goal[sent][:, joints], position[read][:, joints]
+        part = respond((t_s[0][sent], t_s[1][read]), c, q, None if acting is None else acting[sent])
         if part is None:
             continue
-        own = [part.best(k, k, 1.0, _LAGS_S[0])[:2] for k in range(len(joints)) if part.moves[k]]
-        own = [lag for r, lag in own if r > 0.9]
-        if own:
+        own = [
+            part.best(k, k, 1.0, _LAGS_S[0])[:2] for k in range(len(joints)) if min(s[k] for s in part.spread) > _STILL
+        ]
+        if own := [lag for r, lag in own if r > 0.9]:
             middles.append(0.5 * (low + high))
             lags.append(float(np.median(own)))
     if len(lags) < 4:
@@ -392,9 +408,7 @@ def _zero(
         # A step of the goals can hide what follows them.
         leapt = int(np.argmax(np.abs(np.diff(past[edge:-edge, 0])))) + edge + 1
         near = {m for k in (far, leapt) for m in range(max(k - 3, 1), min(k + 4, len(q) - 1))} - {*steps}
-        if not near:
-            break
-        left, k = min((float(fitted([*steps, m])[1].std()), m) for m in near)
+        left, k = min(((float(fitted([*steps, m])[1].std()), m) for m in near), default=(np.inf, 0))
         if left > 0.9 * rest.std():
             break
         steps.append(k)
@@ -405,16 +419,15 @@ def _zero(
         blocks = np.array([b.mean() for b in np.array_split(rest, max(8, int(np.ptp(at) / 1.0)))])
         least = max(0.03, 5.0 * float(blocks.std()))
         moved = sorted((k, float(size)) for k, size in zip(chosen, sizes, strict=True) if abs(size) > least)
-        if not moved or rest.std() > 0.8 * first:
-            continue
-        leaps = any(abs(size) > 0.1 and 0.6 < (q[k] - q[k - 1]) / size < 1.6 for k, size in moved)
-        listed = ", ".join(f"{size:+.3f} rad from {at[k] - t_s[1][0]:.2f} s on" for k, size in moved)
-        text = f"{name} reads against its goal {listed}: one of them has another zero"
-        return [Finding("zero", i, text, "refuse" if leaps else "warn")]
+        if moved and rest.std() <= 0.8 * first:
+            leaps = any(abs(size) > 0.1 and 0.6 < (q[k] - q[k - 1]) / size < 1.6 for k, size in moved)
+            listed = ", ".join(f"{size:+.3f} rad from {at[k] - t_s[1][0]:.2f} s on" for k, size in moved)
+            text = f"{name} reads against its goal {listed}: one of them has another zero"
+            return [Finding("zero", i, text, "refuse" if leaps else "warn")]
     if lag_s is None:
         return []
-    shift = round(lag_s / period_s)
-    error = joined[max(shift, 0) :, 0] - held[: n - max(shift, 0), 0]
+    shift = max(round(lag_s / period_s), 0)
+    error = joined[shift:, 0] - held[: n - shift, 0]
     offset = float(np.median(error))
     if abs(offset) > 0.05 and abs(offset) > 2.0 * float(np.median(np.abs(error - offset))):
         text = f"{name} reads {offset:+.3f} rad against its goal on average: zeros differ, or a load pulls"
@@ -422,33 +435,24 @@ def _zero(
     return []
 
 
-def _rates(
-    t_s: tuple[np.ndarray, np.ndarray], goal: np.ndarray, position: np.ndarray, joints: Sequence[int]
-) -> list[Finding]:
+def _rates(t_s: tuple[np.ndarray, np.ndarray], goal: np.ndarray, position: np.ndarray) -> list[Finding]:
     """Return a finding if one side is sampled too slowly for the motion of the other."""
     findings = []
-    for (t, _), (other, values), what, moved in (
-        ((t_s[0], goal), (t_s[1], position), "goals", "positions"),
-        ((t_s[1], position), (t_s[0], goal), "positions", "goals"),
-    ):
-        own = goal if what == "goals" else position
-        rate_hz, other_hz = _rate(t, own[:, joints]), _rate(other, values[:, joints])
-        if other_hz < 2.0 * rate_hz:
+    sides = ("goals", t_s[0], goal), ("positions", t_s[1], position)
+    for (slow, t, own), (fast, other, values) in (sides, sides[::-1]):
+        rate_hz, fast_hz = _rate(t, own), _rate(other, values)
+        if fast_hz < 2.0 * rate_hz:
             continue
-        grid = np.arange(other[0], other[-1], 1.0 / other_hz)
-        power, total = 0.0, 0.0
-        band = 0.0
-        for i in joints:
-            x = np.interp(grid, other, values[:, i])
-            spectrum = np.abs(np.fft.rfft((x - x.mean()) * np.hanning(len(x)))) ** 2
-            f = np.fft.rfftfreq(len(x), 1.0 / other_hz)
-            power, total = power + float(spectrum[f > 0.5 * rate_hz].sum()), total + float(spectrum.sum())
-            band = max(band, float(f[np.searchsorted(np.cumsum(spectrum), 0.99 * spectrum.sum())]))
-        if power > 0.02 * total:
+        grid = np.arange(other[0], other[-1], 1.0 / fast_hz)
+        x = np.stack([np.interp(grid, other, column) for column in values.T], axis=1)
+        power = (np.abs(np.fft.rfft((x - x.mean(axis=0)) * np.hanning(len(x))[:, None], axis=0)) ** 2).sum(axis=1)
+        f = np.fft.rfftfreq(len(x), 1.0 / fast_hz)
+        if power[f > 0.5 * rate_hz].sum() > 0.02 * power.sum():
+            band = float(f[np.searchsorted(np.cumsum(power), 0.99 * power.sum())])
             text = (
-                f"{rate_hz:.3g} {what} a second are too few for {moved} with power up to {band:.3g} Hz: "
-                f"between two {what} the motion is unknown, so delays and dynamics cannot be "
-                f"identified; log {what} at {4 * band:.0f} Hz"
+                f"{rate_hz:.3g} {slow} a second are too few for {fast} with power up to {band:.3g} Hz: between two "
+                f"{slow} the motion is unknown, so delays and dynamics cannot be identified; log {slow} at "
+                f"{4 * band:.0f} Hz"
             )
             findings.append(Finding("rate", -1, text, "warn"))
     return findings
@@ -474,6 +478,44 @@ def _scales(position: np.ndarray, names: Sequence[str]) -> list[Finding]:
             text = f"{names[i]} reads up to {size:.4g}, the other joints {others.max():.3g}: another unit or scale?"
             findings.append(Finding("scale", i, text, "refuse" if size > TURN_RAD else "warn"))
     return findings
+
+
+def _on_grid(
+    t_s: tuple[np.ndarray, np.ndarray],
+    command: np.ndarray,
+    position: np.ndarray,
+    acting: np.ndarray | None,
+    finer: int = 1,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return a grid with some rows a sample, held commands, interpolated positions, and whether commands act."""
+    begin, end = max(t[0] for t in t_s), min(t[-1] for t in t_s)
+    if not end > begin:
+        none = np.zeros(0)
+        return none, none[:, None], none[:, None], none.astype(bool)
+    period_s = max(min(float(np.median(np.diff(t))) for t in t_s) / finer, (end - begin) / _MAX_ROWS)
+    grid = np.arange(begin, end + 1e-9, period_s)
+    newest = np.clip(np.searchsorted(t_s[0], grid + 1e-6, side="right") - 1, 0, None)
+    joined = np.stack([np.interp(grid, t_s[1], column) for column in position.T], axis=1)
+    live = np.ones(len(grid), bool) if acting is None else np.asarray(acting, bool)[newest]
+    # Between samples of a gap the motion is unknown.
+    after = np.searchsorted(t_s[1], grid).clip(1, len(t_s[1]) - 1)
+    live &= (t_s[1][after] - t_s[1][after - 1]) < max(0.5, 10 * period_s)
+    return grid, command[newest], joined, live
+
+
+# -- single columns
+
+
+def is_rate(t_s: np.ndarray, angle: np.ndarray, velocity: np.ndarray) -> bool:
+    """Return whether velocities ``(N, joints)`` are the rate of angles, in the same unit."""
+    rows = np.isfinite(angle).all(axis=1) & np.isfinite(velocity).all(axis=1) & np.isfinite(t_s)
+    if rows.sum() < 50 or (np.diff(t_s[rows]) <= 0).any():
+        return False
+    rate = np.gradient(angle[rows], t_s[rows], axis=0)
+    rate, v = (ndimage.uniform_filter1d(x, 5, axis=0)[3:-3] for x in (rate, velocity[rows]))
+    moving = v.std(axis=0) > 1e-9
+    x, y = v[:, moving].ravel(), rate[:, moving].ravel()
+    return bool(moving.any() and np.corrcoef(x, y)[0, 1] > 0.8 and 0.8 < (x @ y) / (x @ x) < 1.25)
 
 
 def unsigned(values: np.ndarray) -> int | None:
@@ -509,6 +551,7 @@ def copied(t_goal: np.ndarray, t_position: np.ndarray, goal: np.ndarray, positio
         return copies
     newest = np.searchsorted(t_goal, t_position + 1e-6, side="right") - 1
     most = round(1.0 / max(float(np.median(np.diff(t_goal))), 1e-4))
+    shifts = np.arange(-most, most + 1)
     for i in range(position.shape[1]):
         q, c = position[:, i], goal[:, i]
         # Compare only rows in motion: resting columns are equal at every lag.
@@ -516,20 +559,14 @@ def copied(t_goal: np.ndarray, t_position: np.ndarray, goal: np.ndarray, positio
         rows = np.flatnonzero(moved > 0.01 * moved.max(initial=0.0))
         if q.std() < 1e-9 or len(rows) < 20:
             continue
+        rows = rows[:: max(len(rows) // 400, 1)]
         exact = 1e-5 * q.std() + 1.1e-6 * np.abs(q).max()
-        limit = max(exact, 0.51 * max(_step(c), _step(q)))
-        # Look at a few rows at all shifts, and at all rows of the shifts at which the few are equal.
-        shifts = np.arange(-most, most + 1)
-        allowed = np.where(np.abs(shifts) <= 1, limit, exact)
-        few = rows[:: max(len(rows) // 40, 1)]
-        for some, share in ((few, 0.9), (rows, 0.98)):
-            at = newest[some][:, None] + shifts
-            inside = (at >= 0) & (at < len(c))
-            off = np.abs(q[some][:, None] - c[np.clip(at, 0, len(c) - 1)]) <= allowed
-            equal = (off & inside).sum(axis=0) >= share * np.maximum(inside.sum(axis=0), 1)
-            keep = equal & (inside.sum(axis=0) >= min(20, len(few)))
-            shifts, allowed = shifts[keep], allowed[keep]
-        copies[i] = len(shifts) > 0
+        rounded = max(exact, 0.51 * max(_step(c), _step(q)))
+        at = newest[rows][:, None] + shifts
+        inside = (at >= 0) & (at < len(c))
+        off = np.abs(q[rows][:, None] - c[np.clip(at, 0, len(c) - 1)])
+        equal = (off <= np.where(np.abs(shifts) <= 1, rounded, exact)) & inside
+        copies[i] = ((equal.sum(axis=0) >= 0.98 * inside.sum(axis=0)) & (inside.sum(axis=0) >= 20)).any()
     return copies
 
 
@@ -562,11 +599,6 @@ def counted(values: np.ndarray, turn: float) -> np.ndarray:
         if (np.abs(np.abs(steps) - turn) < play).any():
             column[finite] = np.unwrap(angles, period=turn)
     return result
-
-
-def turns(values: np.ndarray, turn: float) -> np.ndarray:
-    """Return whether a column jumps at the end of a turn, ``(columns,)``."""
-    return np.asarray((np.nan_to_num(counted(values, turn)) != np.nan_to_num(values)).any(axis=0))
 
 
 def glitches(t_s: np.ndarray, angle: np.ndarray) -> np.ndarray:
@@ -612,26 +644,3 @@ def leap(t_s: np.ndarray, angle: np.ndarray) -> tuple[int, int, float] | None:
         return None
     row, column = (int(x[0]) for x in np.nonzero(far))
     return row + 1, column, float(steps[row, column])
-
-
-def _on_grid(
-    t_s: tuple[np.ndarray, np.ndarray],
-    command: np.ndarray,
-    position: np.ndarray,
-    acting: np.ndarray | None,
-    finer: int = 1,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return a grid with some rows a sample, held commands, interpolated positions, and whether commands act."""
-    begin, end = max(t[0] for t in t_s), min(t[-1] for t in t_s)
-    if not end > begin:
-        none = np.zeros(0)
-        return none, none[:, None], none[:, None], none.astype(bool)
-    period_s = max(min(float(np.median(np.diff(t))) for t in t_s) / finer, (end - begin) / _MAX_ROWS)
-    grid = np.arange(begin, end + 1e-9, period_s)
-    newest = np.clip(np.searchsorted(t_s[0], grid + 1e-6, side="right") - 1, 0, None)
-    joined = np.stack([np.interp(grid, t_s[1], column) for column in position.T], axis=1)
-    live = np.ones(len(grid), bool) if acting is None else np.asarray(acting, bool)[newest]
-    # Between samples of a gap the motion is unknown.
-    after = np.searchsorted(t_s[1], grid).clip(1, len(t_s[1]) - 1)
-    live &= (t_s[1][after] - t_s[1][after - 1]) < max(0.5, 10 * period_s)
-    return grid, command[newest], joined, live

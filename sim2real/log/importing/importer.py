@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,44 +15,40 @@ from sim2real.errors import OK, UsageError
 from sim2real.graph.episode import Episode, StepRecord, Steps
 from sim2real.installation import version
 from sim2real.log.importing import checks
-from sim2real.log.importing.mapping import (
-    STAMP_UNITS,
-    FieldMapping,
-    ImportMapping,
-    NodeMapping,
-    in_si,
-    load_mapping,
-    positive,
-)
+from sim2real.log.importing.mapping import STAMP_UNITS, FieldMapping, ImportMapping, NodeMapping, in_si, load_mapping
 from sim2real.log.importing.names import meaning
 from sim2real.log.importing.readers import Table, open_tables
 from sim2real.log.writer import SessionFile
 from sim2real.types import Json
 
-RECORDED, GENERATED = "recorded", "generated"
 _MAX_TICKS = 2**53  # 285 years [us]: whole numbers up to here are exact in float64
 # Stamps from here on [us since 1970: September 2001] come from a wall clock; clocks that start at boot are far lower.
 _WALL_CLOCK = 10**15
 # With a first stamp up to here [us], stamps count from the recording's start; otherwise time 0 is the first sample.
 _OWN_START = 1_000_000
-_COMMANDING = "actuator"
 
 
-@dataclass(frozen=True)
-class _Signals:
-    """The signals of one node.
+@dataclass
+class _Stream:
+    """The samples of one node, before and after a selection.
 
     Attributes:
-        fields: Field -> values, shape ``(N, ...)``, or ``()`` for a constant.
-        stamps: Shape ``(N,)``: recorded time stamps; None without any.
-        count: Number of samples N.
+        fields: Field -> values in the log's unit, shape ``(N, ...)``, or ``()`` for a constant.
+        stamps: Shape ``(N,)``, as recorded; None without any.
         rate_hz: Rate from which stamps are generated [Hz]; None with recorded stamps.
+        rows: The numbers of the selected samples in the file.
+        dropped: Policy -> number of samples that it dropped.
     """
 
-    fields: Mapping[str, np.ndarray]
+    fields: dict[str, np.ndarray]
     stamps: np.ndarray | None
-    count: int
     rate_hz: float | None
+    rows: np.ndarray
+    dropped: Counter[str]
+
+    def keep(self, good: np.ndarray, policy: str) -> None:
+        self.dropped[policy] += int((~good).sum())
+        self.rows = self.rows[good]
 
 
 def import_file(
@@ -59,7 +56,7 @@ def import_file(
 ) -> Episode:
     """Read a file of another recorder as an episode.
 
-    Each sample becomes a step that starts and ends at the sample's time stamp. Recorded stamps are selected, rounded to
+    Each sample becomes a step that starts and ends at the sample's time stamp. Recorded stamps are rounded to
     microseconds. If the first one is within 1 s after 0, time 0 is that of the file; otherwise time 0 is the first
     sample. Without recorded stamps, they are generated from the node's rate; stamps of a LeRobot data set that are
     ``frame_index / fps`` count as generated. The episode's metadata has ``stamps``
@@ -82,29 +79,25 @@ def import_file(
     return import_table(tables[0], chosen, samples)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # damaged files hold numbers of any size
 def import_table(table: Table, mapping: ImportMapping, samples: slice | None = None) -> Episode:
     """Return a table as an episode; see ``import_file``."""
-    # Read all signals, and select the samples of each node.
-    signals = {name: _signals(table, name, node) for name, node in mapping.nodes.items()}
-    first, stop = _range(table, {name: s.count for name, s in signals.items()}, samples)
-    ticks, outputs, stamps, dropped = {}, {}, {}, {}
+    streams = {name: _stream(table, name, node) for name, node in mapping.nodes.items()}
+    first = _cut(table, streams, samples)
+    ticks = {}
     for name, node in mapping.nodes.items():
-        own, last = signals[name], signals[name].count if stop is None else stop
-        selected = _selected(node, own, first, last)
-        selected = _plausible(f"node {name} in {table.path}", node, own, selected)
-        outputs[name] = {
-            field: _samples(table, f"{name}.{field}", own.fields[field], how, selected)
-            for field, how in node.fields.items()
-        }
-        ticks[name] = _ticks(table, name, node, own, selected)
-        stamps[name] = GENERATED if own.stamps is None or node.stamps in table.nominal else RECORDED
-        dropped[name] = last - first - len(selected)
-    # Move time 0 to the file's zero or the first sample.
+        _select(table, name, node, streams[name])
+        ticks[name] = _ticks(table, name, node, streams[name])
+    outputs = {
+        name: {f: _samples(table, name, f, how, streams[name]) for f, how in node.fields.items()}
+        for name, node in mapping.nodes.items()
+    }
     _align_turns(mapping, outputs, ticks)
-    from_file = [name for name, own in signals.items() if own.stamps is not None]
-    begin = min((int(ticks[name][0]) for name in from_file), default=0)
+    # Move time 0 to the file's zero or the first sample.
+    recorded = [name for name, own in streams.items() if own.stamps is not None]
+    begin = min((int(ticks[name][0]) for name in recorded), default=0)
     zero = 0 if 0 <= begin <= _OWN_START and not first else begin
-    for name in from_file:
+    for name in recorded:
         ticks[name] -= zero
     source = {
         "file": table.path.name,
@@ -114,7 +107,7 @@ def import_table(table: Table, mapping: ImportMapping, samples: slice | None = N
         **({"notes": list(table.notes)} if table.notes else {}),
         "first_sample": first,
         "time_zero_us": zero,
-        "dropped": dropped,
+        "dropped": {name: {p: n for p, n in own.dropped.items() if n} for name, own in streams.items()},
     }
     return Episode(
         steps={name: _steps(t) for name, t in ticks.items()},
@@ -123,7 +116,10 @@ def import_table(table: Table, mapping: ImportMapping, samples: slice | None = N
         metadata={
             "pipeline": mapping.pipeline,
             "source": source,
-            "stamps": stamps,
+            "stamps": {
+                name: "recorded" if node.stamps is not None and node.stamps not in table.nominal else "generated"
+                for name, node in mapping.nodes.items()
+            },
             "graph": {name: {"rate_hz": _rate_hz(t), "inputs": {}} for name, t in ticks.items()},
             "mapping": {name: msgspec.to_builtins(node) for name, node in mapping.nodes.items()},
             "versions": {"sim2real": version()},
@@ -155,7 +151,8 @@ def write_log(path: str | Path, episode: Episode, mapping: ImportMapping) -> Non
         counts = [len(episode.steps[n]) for n in names]
         seq = np.concatenate([np.arange(n) for n in counts])
         node = np.repeat(np.arange(len(names)), counts)
-        order = np.repeat([_order(name, mapping.nodes[name]) for name in names], counts)
+        order = [mapping.nodes[n].order for n in names]
+        order = np.repeat([int(n == "actuator") if k is None else k for n, k in zip(names, order, strict=True)], counts)
         ticks = np.concatenate([episode.steps[n].start for n in names])
         for row in np.lexsort((node, order, ticks)).tolist():
             name, k, tick = names[node[row]], int(seq[row]), int(ticks[row])
@@ -172,7 +169,7 @@ def write_log(path: str | Path, episode: Episode, mapping: ImportMapping) -> Non
 
 def facts(episode: Episode) -> dict[str, Json]:
     """Return the summary of an import."""
-    dropped = {n: k for n, k in episode.metadata["source"]["dropped"].items() if k}
+    dropped = {n: sum(by.values()) for n, by in episode.metadata["source"]["dropped"].items() if by}
     return {
         "source": episode.metadata["source"]["file"],
         "seconds": episode.duration_s,
@@ -183,18 +180,12 @@ def facts(episode: Episode) -> dict[str, Json]:
     }
 
 
-def _order(name: str, node: NodeMapping) -> int:
-    return int(name == _COMMANDING) if node.order is None else node.order
+# -- the signals of a node
 
 
-def _sha256(path: Path) -> str:
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
-def _signals(table: Table, name: str, node: NodeMapping) -> _Signals:
+def _stream(table: Table, name: str, node: NodeMapping) -> _Stream:
     """Read a node's signals, all of the same length."""
-    fields = {field: _field(table, f"{name}.{field}", how) for field, how in node.fields.items()}
+    fields = {field: _field(table, name, field, how) for field, how in node.fields.items()}
     stamps = None if node.stamps is None else table.signal(node.stamps)
     if stamps is not None and stamps.ndim != 1:
         raise UsageError(
@@ -204,35 +195,32 @@ def _signals(table: Table, name: str, node: NodeMapping) -> _Signals:
     rate_hz = node.rate_hz
     if isinstance(rate_hz, str):
         rate = table.signal(rate_hz)
-        if rate.ndim:
+        if rate.ndim or not 0.0 < rate < np.inf:
             raise UsageError(
-                f"rate_hz of node {name!r} is {rate_hz!r}, which has the shape {rate.shape}",
-                hint="if the signal has the stamps, write stamps instead of rate_hz",
+                f"rate_hz of node {name!r} is {rate_hz!r}, which is {rate if not rate.ndim else rate.shape}",
+                hint="a rate is one number above 0; if the signal has the stamps, write stamps instead of rate_hz",
             )
-        rate_hz = positive(float(rate), f"{rate_hz!r} in {table.path}")
+        rate_hz = float(rate)
     # All signals of a node need one length.
     lengths = {field: len(values) for field, values in fields.items() if values.ndim}
     if stamps is not None:
         lengths[f"stamps {node.stamps!r}"] = len(stamps)
-    if not lengths:
+    listed = ", ".join(f"{signal} {length}" for signal, length in lengths.items())
+    if len(set(lengths.values())) != 1:
         raise UsageError(
-            f"node {name!r} gets only constants from {table.path}",
-            hint="add the node's stamps, which determine its samples",
-        )
-    if len(set(lengths.values())) > 1:
-        listed = ", ".join(f"{signal} {length}" for signal, length in lengths.items())
-        raise UsageError(
-            f"the signals of node {name!r} differ in length: {listed}",
-            hint="put signals with other stamps into another node",
+            f"the signals of node {name!r} differ in length: {listed}"
+            if lengths
+            else f"node {name!r} gets only constants from {table.path}",
+            hint="put signals with other stamps into another node; the stamps determine a node's samples",
         )
     count = next(iter(lengths.values()))
     if not count:
         raise UsageError(f"node {name!r} has no samples in {table.path}", hint="check that the file is complete")
-    return _Signals(fields, stamps, count, rate_hz)
+    return _Stream(fields, stamps, rate_hz, np.arange(count), Counter())
 
 
-def _field(table: Table, where: str, how: FieldMapping) -> np.ndarray:
-    """Read a field's signal, unscaled; several sources are stacked along the last axis."""
+def _field(table: Table, node: str, field: str, how: FieldMapping) -> np.ndarray:
+    """Return a field's values in the log's unit; several sources are stacked along the last axis."""
     parts = [table.signal(source) for source in how.sources]
     for source, part in zip(how.sources, parts, strict=True):
         # Jumps by 2^16 or 2^32 are counts that were read with the wrong sign, whatever their unit.
@@ -244,24 +232,36 @@ def _field(table: Table, where: str, how: FieldMapping) -> np.ndarray:
                     hint="decode them as signed (two's complement, or a sign bit) before the import",
                 )
     try:
-        values = parts[0] if len(parts) == 1 else np.stack(np.broadcast_arrays(*parts), axis=-1)
+        raw = parts[0] if len(parts) == 1 else np.stack(np.broadcast_arrays(*parts), axis=-1)
     except ValueError:
         shapes = ", ".join(f"{source} {part.shape}" for source, part in zip(how.sources, parts, strict=True))
         raise UsageError(
-            f"the sources of field {where} differ in shape: {shapes}", hint="stack signals of one length"
+            f"the sources of field {node}.{field} differ in shape: {shapes}", hint="stack signals of one length"
         ) from None
-    if not how.turn or not values.ndim:
-        return values
-    # Count turns over all samples, so that a part of a file has the same turns as the whole.
-    return checks.counted(values.reshape(len(values), -1), how.turn).reshape(values.shape)
+    values = raw.astype(np.float64)
+    if how.turn and values.ndim:
+        # Count turns over all samples, so that a part of a file has the same turns as the whole.
+        values = checks.counted(values.reshape(len(values), -1), how.turn).reshape(values.shape)
+    scale, offset = (np.squeeze(x) if np.size(x) == 1 else np.asarray(x) for x in (how.scale, how.offset))
+    for key, numbers in (("scale", scale), ("offset", offset)):
+        if numbers.ndim and numbers.shape != values.shape[values.ndim > 0 :]:
+            raise UsageError(
+                f"field {node}.{field} has {numbers.size} values of {key} for samples of shape {values.shape[1:]}",
+                hint="give one number, or one for each column",
+            )
+    scaled = scale * values + offset
+    factor, _ = in_si(how.unit)
+    kept = raw.dtype if raw.dtype.kind == "f" and not how.turn else np.float64
+    return (scaled if factor == 1.0 else factor * scaled).astype(kept)
 
 
-def _range(table: Table, counts: Mapping[str, int], samples: slice | None) -> tuple[int, int | None]:
-    """Return the first sample, and the one after the last; None for the end."""
+def _cut(table: Table, streams: Mapping[str, _Stream], samples: slice | None) -> int:
+    """Select a range of samples; return the first."""
     if samples is None:
-        return 0, None
+        return 0
     if samples.step not in (None, 1):
         raise UsageError(f"a range of samples has no step, got {samples.step}", hint="remove the step")
+    counts = {name: len(own.rows) for name, own in streams.items()}
     if len(set(counts.values())) > 1:
         listed = ", ".join(f"{name} {count}" for name, count in counts.items())
         raise UsageError(
@@ -275,131 +275,91 @@ def _range(table: Table, counts: Mapping[str, int], samples: slice | None) -> tu
     if beyond or first >= stop:
         text = ":".join("" if n is None else str(n) for n in (samples.start, samples.stop))
         raise UsageError(f"samples {text} are not in {table.path}: it has {count}", hint=f"choose from 0:{count}")
-    return first, stop
+    for own in streams.values():
+        own.rows = own.rows[first:stop]
+    return first
 
 
-def _selected(node: NodeMapping, own: _Signals, first: int, stop: int) -> np.ndarray:
-    """Return the numbers of the samples from ``first`` to just before ``stop`` that the node's policies select."""
-    selected = np.arange(first, stop)
+def _select(table: Table, name: str, node: NodeMapping, own: _Stream) -> None:
+    """Drop the samples that the node's policies drop, and refuse positions that no joint can have."""
     series = [v for v in (*own.fields.values(), own.stamps) if v is not None and v.ndim]
+    whole = np.logical_and.reduce([np.isfinite(v).reshape(len(v), -1).all(axis=1) for v in series])
     if node.missing == "drop":
-        good = np.logical_and.reduce([np.isfinite(v[first:stop]).reshape(stop - first, -1).all(axis=1) for v in series])
-        selected = selected[good]
-    if node.repeated == "first" and own.stamps is not None and len(selected):
-        stamps = own.stamps[selected]
-        selected = selected[np.concatenate([[True], stamps[1:] != stamps[:-1]])]
-    return selected
-
-
-def _plausible(where: str, node: NodeMapping, own: _Signals, selected: np.ndarray) -> np.ndarray:
-    """Return the numbers of the samples with possible positions.
-
-    Raises:
-        UsageError: When positions leap away and back and the mapping has no ``implausible = "drop"``, jump at the end
-            of a turn without counting, or change faster than a joint can move.
-    """
-    if own.stamps is None:
-        t_s = selected / (own.rate_hz or 1.0)
-    else:
-        t_s = own.stamps[selected] * (STAMP_UNITS[node.stamp_unit] * 1e-9)
-    if len(selected) < 3 or not (np.isfinite(t_s).all() and (np.diff(t_s) > 0).all()):
-        return selected  # the check of stamps raises the better error
+        own.keep(whole[own.rows], "missing")
+    if node.repeated == "first" and own.stamps is not None and len(own.rows):
+        stamps = own.stamps[own.rows]
+        own.keep(np.concatenate([[True], stamps[1:] != stamps[:-1]]), "repeated")
     for field, how in node.fields.items():
         named = meaning(field)
-        if (
-            how.log_unit != "rad"
-            or named.side == "command"
-            or named.quantity != "position"
-            or not own.fields[field].ndim
-        ):
-            continue
-        values = own.fields[field][selected].reshape(len(selected), -1)
-        angle = values * (np.asarray(how.scale) * in_si(how.unit)[0])
-        if not np.isfinite(angle).all():
-            continue
-        what = f"field {field} of {where}"
-        if not how.turn and (over := checks.turns(angle, checks.TURN_RAD)).any():
-            raise UsageError(
-                f"column {int(over.argmax())} of {what} jumps by 2 pi at the end of a turn",
-                hint="turn = 6.283185307179586 (360 for degrees) beside the field's source in the mapping counts them",
-            )
-        # Drop or refuse samples that leap away and back.
-        leapt = checks.glitches(t_s, angle)
-        if leapt.any() and node.implausible == "refuse":
-            k, i = (int(x[0]) for x in np.nonzero(leapt))
-            raise UsageError(
-                f"column {i} of {what} reads {angle[k, i]:.4g} rad in sample {selected[k]}: it leaps away and back, "
-                f"faster than a joint can, in {int(leapt.any(axis=1).sum())} samples",
-                hint='implausible = "drop" in the mapping skips such samples',
-            )
-        selected, angle, t_s = (x[~leapt.any(axis=1)] for x in (selected, angle, t_s))
-        # A jump without return means another zero, another unit or missing samples.
-        if (jump := checks.leap(t_s, angle)) is not None:
-            raise UsageError(
-                f"column {jump[1]} of {what} changes by {jump[2]:.4g} rad before sample {selected[jump[0]]}, within "
-                f"{t_s[jump[0]] - t_s[jump[0] - 1]:.3g} s: a joint cannot, so its zero or its unit has changed",
-                hint="cut the file there with --samples A:B, or omit this joint",
-            )
-    return selected
+        if named.quantity == "position" and named.side != "command" and how.log_unit == "rad":
+            _plausible(table, name, field, node, own)
 
 
-def _align_turns(
-    mapping: ImportMapping, outputs: Mapping[str, dict[str, np.ndarray]], ticks: Mapping[str, np.ndarray]
-) -> None:
-    """Shift commands to the turn of their positions, as turns are counted from the start of each signal."""
-    angles = [
-        (name, field, how)
-        for name, node in mapping.nodes.items()
-        for field, how in node.fields.items()
-        if how.log_unit in ("rad", "")  # without a unit where a robot has hinges and slides
-    ]
-    for name, field, how in angles:
-        for other, goal, its in angles:
-            a, b = outputs[name][field], outputs[other][goal]
-            if meaning(field).side == "command" or meaning(goal).side != "command" or not (how.turn or its.turn):
-                continue
-            if meaning(field).quantity != "position" or a.shape[1:] != b.shape[1:] or min(len(a), len(b)) < 2:
-                continue
-            q, c = (x.reshape(len(x), -1) for x in (a, b))
-            at = np.stack([np.interp(ticks[other], ticks[name], column) for column in q.T], axis=1)
-            turned = c - checks.TURN_RAD * np.round(np.median(c - at, axis=0) / checks.TURN_RAD)
-            outputs[other][goal] = turned.reshape(b.shape)
+def _plausible(table: Table, name: str, field: str, node: NodeMapping, own: _Stream) -> None:
+    """Drop samples whose positions leap away and back.
 
-
-def _samples(table: Table, where: str, values: np.ndarray, how: FieldMapping, selected: np.ndarray) -> np.ndarray:
-    """Return a field's samples, scaled, shape ``(N, ...)``; a constant is repeated."""
-    values = values[selected] if values.ndim else np.broadcast_to(values, selected.shape)
-    _check_finite(table, f"field {where}", values, selected)
-    dtype = values.dtype if values.dtype.kind == "f" else np.dtype(np.float64)
-    # Scale and reshape the samples.
-    scale, offset = (np.squeeze(x) if np.size(x) == 1 else np.asarray(x) for x in (how.scale, how.offset))
-    for key, numbers in (("scale", scale), ("offset", offset)):
-        if numbers.ndim and numbers.shape != values.shape[1:]:
-            raise UsageError(
-                f"field {where} has {numbers.size} values of {key} for samples of shape {values.shape[1:]}",
-                hint="give one number, or one for each column",
-            )
-    scaled = scale * values.astype(np.float64) + offset
-    factor, _ = in_si(how.unit)
-    scaled = (scaled if factor == 1.0 else factor * scaled).astype(dtype)
-    shape = scaled.shape[1:] if how.shape is None else how.shape
-    if shape != (-1,) and np.prod(shape, dtype=int) != np.prod(scaled.shape[1:], dtype=int):
+    Raises:
+        UsageError: When such samples are not to be dropped, when angles jump at the end of a turn without counting, or
+            change faster than a joint can move.
+    """
+    what, values = f"field {field} of node {name} in {table.path}", own.fields[field]
+    t_s = own.rows / (own.rate_hz or 1.0)
+    if own.stamps is not None:
+        t_s = own.stamps[own.rows] * (STAMP_UNITS[node.stamp_unit] * 1e-9)
+    if not values.ndim or len(own.rows) < 3 or not (np.isfinite(t_s).all() and (np.diff(t_s) > 0).all()):
+        return  # the check of stamps raises the better error
+    angle = values[own.rows].reshape(len(own.rows), -1).astype(np.float64)
+    if not np.isfinite(angle).all():
+        return
+    if not node.fields[field].turn and (over := (checks.counted(angle, checks.TURN_RAD) != angle).any(axis=0)).any():
         raise UsageError(
-            f"a sample of field {where} has the shape {scaled.shape[1:]} in {table.path}, and {shape} in the mapping",
+            f"column {int(over.argmax())} of {what} jumps by 2 pi at the end of a turn",
+            hint="turn = 6.283185307179586 (360 for degrees) beside the field's source in the mapping counts them",
+        )
+    leapt = checks.glitches(t_s, angle)
+    if leapt.any() and node.implausible == "refuse":
+        k, i = (int(x[0]) for x in np.nonzero(leapt))
+        raise UsageError(
+            f"column {i} of {what} reads {angle[k, i]:.4g} rad in sample {own.rows[k]}: it leaps away and back, "
+            f"faster than a joint can, in {int(leapt.any(axis=1).sum())} samples",
+            hint='implausible = "drop" in the mapping skips such samples',
+        )
+    good = ~leapt.any(axis=1)
+    # A jump without return means another zero, another unit or missing samples.
+    if (jump := checks.leap(t_s[good], angle[good])) is not None:
+        k, i, size = jump
+        raise UsageError(
+            f"column {i} of {what} changes by {size:.4g} rad before sample {own.rows[good][k]}, within "
+            f"{t_s[good][k] - t_s[good][k - 1]:.3g} s: a joint cannot, so its zero or its unit has changed",
+            hint="cut the file there with --samples A:B, or omit this joint",
+        )
+    own.keep(good, "implausible")
+
+
+def _samples(table: Table, name: str, field: str, how: FieldMapping, own: _Stream) -> np.ndarray:
+    """Return the selected samples of a field, shape ``(N, ...)``; a constant is repeated."""
+    values = own.fields[field]
+    values = values[own.rows] if values.ndim else np.broadcast_to(values, own.rows.shape)
+    _check_finite(table, f"field {name}.{field}", values, own.rows)
+    shape = values.shape[1:] if how.shape is None else how.shape
+    if shape != (-1,) and np.prod(shape, dtype=int) != np.prod(values.shape[1:], dtype=int):
+        raise UsageError(
+            f"a sample of field {name}.{field} has the shape {values.shape[1:]} in {table.path}, and {shape} in the "
+            "mapping",
             hint="correct the shape, or choose columns of the source",
         )
-    return np.ascontiguousarray(scaled.reshape(len(scaled), *shape))
+    return np.ascontiguousarray(values.reshape(len(values), *shape))
 
 
-def _ticks(table: Table, name: str, node: NodeMapping, own: _Signals, selected: np.ndarray) -> np.ndarray:
-    """Return the stamps of samples, shape ``(N,)``, int64 [us]."""
+def _ticks(table: Table, name: str, node: NodeMapping, own: _Stream) -> np.ndarray:
+    """Return the stamps of the selected samples, shape ``(N,)``, int64 [us]."""
     if own.stamps is None:
         # Use the slots of the timing rules for a node of this rate.
-        return np.floor((selected - selected[:1]) * 1e6 / (own.rate_hz or 1.0) + 0.5).astype(np.int64)
-    stamps = own.stamps[selected]
+        return np.floor((own.rows - own.rows[:1]) * 1e6 / (own.rate_hz or 1.0) + 0.5).astype(np.int64)
+    stamps = own.stamps[own.rows]
     what = f"stamps {node.stamps!r} of node {name!r}"
     hint = f"stamp_unit is {node.stamp_unit!r}; available: {', '.join(STAMP_UNITS)}"
-    _check_finite(table, what, stamps, selected)
+    _check_finite(table, what, stamps, own.rows)
     nanoseconds = STAMP_UNITS[node.stamp_unit]
     if not len(stamps):
         raise UsageError(f"no sample of node {name!r} in {table.path} is complete", hint="check its columns")
@@ -412,19 +372,43 @@ def _ticks(table: Table, name: str, node: NodeMapping, own: _Signals, selected: 
     if (wrong := np.flatnonzero(np.diff(ticks) <= 0)).size:
         k = int(wrong[0])
         raise UsageError(
-            f"{what} in {table.path} do not increase: sample {selected[k]} at {stamps[k]} {node.stamp_unit}, "
-            f"sample {selected[k + 1]} at {stamps[k + 1]} {node.stamp_unit}",
+            f"{what} in {table.path} do not increase: sample {own.rows[k]} at {stamps[k]} {node.stamp_unit}, "
+            f"sample {own.rows[k + 1]} at {stamps[k + 1]} {node.stamp_unit}",
             hint=f"samples must be a microsecond apart at least; {hint}",
         )
     return ticks + round(1e6 * node.stamp_offset)
 
 
-def _check_finite(table: Table, what: str, values: np.ndarray, selected: np.ndarray) -> None:
+def _align_turns(
+    mapping: ImportMapping, outputs: Mapping[str, dict[str, np.ndarray]], ticks: Mapping[str, np.ndarray]
+) -> None:
+    """Shift commands to the turn of their positions, as turns are counted from the start of each signal."""
+    angles = [
+        (name, field, how)
+        for name, node in mapping.nodes.items()
+        for field, how in node.fields.items()
+        if how.log_unit in ("rad", "")  # without a unit where a robot has hinges and slides
+    ]
+    positions = [a for a in angles if meaning(a[1]).quantity == "position" and meaning(a[1]).side != "command"]
+    for name, field, how in positions:
+        for other, goal, its in angles:
+            a, b = outputs[name][field], outputs[other][goal]
+            if meaning(goal).side != "command" or not (how.turn or its.turn):
+                continue
+            if a.shape[1:] != b.shape[1:] or min(len(a), len(b)) < 2:
+                continue
+            q, c = (x.reshape(len(x), -1) for x in (a, b))
+            at = np.stack([np.interp(ticks[other], ticks[name], column) for column in q.T], axis=1)
+            turned = c - checks.TURN_RAD * np.round(np.median(c - at, axis=0) / checks.TURN_RAD)
+            outputs[other][goal] = turned.reshape(b.shape)
+
+
+def _check_finite(table: Table, what: str, values: np.ndarray, rows: np.ndarray) -> None:
     finite = np.isfinite(values).reshape(len(values), -1).all(axis=1)
     if not finite.all():
         k = int(np.argmin(finite))
         raise UsageError(
-            f"{what} is no finite number in sample {selected[k]} of {table.path}: {values[k]}",
+            f"{what} is no finite number in sample {rows[k]} of {table.path}: {values[k]}",
             hint='cut it off with --samples A:B, or write missing = "drop" into the mapping, which skips such samples',
         )
 
@@ -436,3 +420,8 @@ def _steps(ticks: np.ndarray) -> Steps:
 
 def _rate_hz(ticks: np.ndarray) -> float | None:
     return round(1e6 / float(np.median(np.diff(ticks))), 3) if len(ticks) > 1 else None
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()

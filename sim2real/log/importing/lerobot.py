@@ -47,75 +47,63 @@ def read_lerobot(path: Path, episode: int | None = None) -> list[Table]:
         parts = [_columns(pyarrow.parquet.ParquetFile(file), notes) for file in files]
     except (pyarrow.ArrowException, OSError, ValueError) as error:
         raise UsageError(f"{path} is no Parquet file, or is cut off: {error}", hint=_WHOLE) from None
-    rows = {
-        name: parts[0][name] if len(parts) == 1 else np.concatenate([part[name] for part in parts])
-        for name in parts[0]
-        if all(name in part for part in parts)
-    }
-    names = _names(info)
-    if "episode_index" not in rows:
+    rows = {name: np.concatenate([p[name] for p in parts]) for name in parts[0] if all(name in p for p in parts)}
+    number = rows.get("episode_index")
+    if number is None:
         if episode is not None:
             raise UsageError(f"{path} has no episode_index, so it holds no episodes", hint="remove --episode")
-        return [_table(path, files, rows, names, notes, info, 0, len(next(iter(rows.values()), [])))]
-    numbers = rows["episode_index"].astype(int)
-    found = np.unique(numbers)
+        return [_table(files, rows, notes, info, 0)]
+    found = np.unique(number).astype(int).tolist()
     if episode is not None and episode not in found:
         listed = f"{found[0]} to {found[-1]}" if len(found) > 1 else ", ".join(map(str, found)) or "none"
         raise UsageError(f"{path} has no episode {episode}. Available: {listed}", hint="choose another --episode")
-    tables = []
-    for number in found if episode is None else [episode]:
-        at = np.flatnonzero(numbers == number)
-        chosen = {name: values[at] for name, values in rows.items()}
-        tables.append(_table(path, files, chosen, names, notes, info, int(number), len(at)))
-    return tables
+    chosen = found if episode is None else [episode]
+    return [_table(files, {n: v[number == k] for n, v in rows.items()}, notes, info, k) for k in chosen]
 
 
 def _table(
-    path: Path, files: Sequence[Path], rows: Mapping[str, np.ndarray], names: Mapping[str, list[str]],
-    notes: Sequence[str], info: Mapping[str, Any], episode: int, count: int,
-) -> Table:  # fmt: skip
+    files: Sequence[Path], rows: Mapping[str, np.ndarray], notes: Sequence[str], info: Mapping[str, Any], episode: int
+) -> Table:
     table = Table(files[0], "lerobot", notes=list(dict.fromkeys(notes)), beside=tuple(files[1:]))
     is_set = bool(info) or "observation.state" in rows
     table.robot = str(info.get("robot_type") or "an unknown robot") if is_set else ""
     for name, values in rows.items():
         if name not in _COUNTERS or not is_set:
             table.add(name, values)
-    table.names = {name: listed for name, listed in names.items() if name in table.columns}
+    table.names = {name: listed for name, listed in _names(info).items() if name in table.columns}
     # Stamps that are frame_index / fps are no measurement.
     fps, stamps = info.get("fps"), table.columns.get("timestamp")
+    if fps:
+        table.columns["fps"] = np.asarray(fps, np.float64)
     if fps and stamps is not None and len(stamps):
-        frames = np.asarray(rows.get("frame_index", np.arange(count)), float)
+        frames = np.asarray(rows.get("frame_index", np.arange(len(stamps))), float)
         rounding = float(np.spacing(np.float32(np.abs(stamps).max())))
         if (np.abs(stamps - frames / fps) <= 1e-3 / fps + rounding).all():
             table.nominal.add("timestamp")
             table.notes.append(f"'timestamp' is frame_index / fps: nominal times at {fps:g} Hz, not measured ones")
-    if fps:
-        table.columns["fps"] = np.asarray(fps, np.float64)
     if is_set and episode:
         table.notes.append(f"episode {episode}")
     return table
 
 
 def _columns(file: Any, notes: list[str]) -> dict[str, np.ndarray]:
-    """Return the columns of a file that hold numbers, or lists of them."""
+    """Return the columns of a file that hold numbers or texts, or lists of them."""
     import pyarrow.types as is_
 
     columns: dict[str, np.ndarray] = {}
     for name in file.schema_arrow.names:
-        kind = file.schema_arrow.field(name).type
-        inner, levels = kind, 1
-        while is_.is_list(inner) or is_.is_large_list(inner) or is_.is_fixed_size_list(inner):
-            inner, levels = inner.value_type, levels + 1
-        number = is_.is_integer(inner) or is_.is_floating(inner) or is_.is_boolean(inner) or is_.is_temporal(inner)
-        if levels > 2 or not (number or is_.is_string(inner)):
-            notes.append(f"skipped: {name!r} holds {inner}" + (f" in {levels} dimensions" if levels > 2 else ""))
+        kind, levels = file.schema_arrow.field(name).type, 1
+        while is_.is_list(kind) or is_.is_large_list(kind) or is_.is_fixed_size_list(kind):
+            kind, levels = kind.value_type, levels + 1
+        known = is_.is_integer, is_.is_floating, is_.is_boolean, is_.is_temporal, is_.is_string
+        if levels > 2 or not any(is_known(kind) for is_known in known):
+            notes.append(f"skipped: {name!r} holds {kind}" + f" in {levels} dimensions" * (levels > 2))
             continue
         column = file.read(columns=[name]).column(0)
+        lists = column.to_numpy()
         if levels == 1:
-            columns[name] = column.to_numpy()
-            continue
-        lists = column.to_pylist() if column.null_count else [np.asarray(part) for part in column.to_numpy()]
-        if len({len(part) for part in lists if part is not None}) == 1 and not column.null_count:
+            columns[name] = lists
+        elif not column.null_count and len({len(part) for part in lists}) == 1:
             columns[name] = np.stack(lists)
         else:
             notes.append(f"skipped: {name!r} has lists of different lengths")

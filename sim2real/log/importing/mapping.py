@@ -1,4 +1,4 @@
-"""Mapping files (TOML), which assign the signals of another recorder's file to the fields of nodes."""
+"""The mapping of another recorder's file to a log: the source of each field. Its file is ``import.toml``."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 
@@ -20,10 +20,10 @@ STAMP_UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 """Unit of time stamps -> nanoseconds."""
 MAPPING = "import.toml"
 """The mapping file in a pipeline's folder."""
+Key = tuple[str, str, str]
+"""Node, field or empty, and key of a line of a mapping file."""
 _SI = {"deg": (math.pi / 180, "rad"), "rev": (2 * math.pi, "rad"), "mrad": (1e-3, "rad"), "mm": (1e-3, "m")}
-"""Unit that is converted -> factor and SI unit."""
-_BARE = re.compile(r"[A-Za-z0-9_-]+")
-_OPEN = re.compile(r"^#\s*([a-z_]+) = .*\?", re.MULTILINE)
+_OPEN_QUESTION = re.compile(r"^#\s*([a-z_]+) = .*\?", re.MULTILINE)
 _HINT = "the guide 'Import' has a mapping file with every key"
 
 
@@ -39,7 +39,11 @@ def in_si(unit: str) -> tuple[float, str]:
     return factor, f"{si}{per}{time}"
 
 
-class FieldMapping(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """A table of a mapping file; a key that it does not know is an error."""
+
+
+class FieldMapping(_Table, frozen=True):
     """The source of a field of a node's output.
 
     Attributes:
@@ -84,7 +88,7 @@ class FieldMapping(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
         return in_si(self.unit)[1]
 
 
-class NodeMapping(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+class NodeMapping(_Table, frozen=True):
     """The source of a node's messages.
 
     Attributes:
@@ -115,13 +119,13 @@ class NodeMapping(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
             raise ValueError("a node has fields: fields.NAME = { source = ... }")
         if (self.rate_hz is None) == (self.stamps is None):
             raise ValueError("a node has either 'stamps', which are recorded, or 'rate_hz', which generates them")
-        if isinstance(self.rate_hz, float):
-            positive(self.rate_hz, "rate_hz")
+        if isinstance(self.rate_hz, float) and not 0.0 < self.rate_hz < math.inf:
+            raise ValueError(f"rate_hz must be above 0, in samples per second, got {self.rate_hz}")
         if not math.isfinite(self.stamp_offset) or (self.stamp_offset and self.stamps is None):
             raise ValueError("stamp_offset is a finite number [s], added to recorded stamps")
 
 
-class ImportMapping(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+class ImportMapping(_Table, frozen=True):
     """The mapping of another recorder's file to a log.
 
     Attributes:
@@ -139,20 +143,6 @@ class ImportMapping(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omi
         """Node -> field -> unit in the log, for the fields that have one."""
         return {n: {f: m.log_unit for f, m in node.fields.items() if m.unit} for n, node in self.nodes.items()}
 
-    def of_joints(self) -> ImportMapping:
-        """Return the mapping with a vector for each field, as joints have it."""
-        nodes = {
-            name: msgspec.structs.replace(
-                n, fields={k: msgspec.structs.replace(f, shape=f.shape or (-1,)) for k, f in n.fields.items()}
-            )
-            for name, n in self.nodes.items()
-        }
-        return msgspec.structs.replace(self, nodes=nodes)
-
-    def inputs(self, file: Path) -> dict[str, Path]:
-        """Return the files that an import reads, by name, for the manifest."""
-        return {"source": file} | ({} if self.path is None else {"mapping": self.path})
-
     @staticmethod
     def from_dict(tables: Mapping[str, Json], pipeline: str | None = None, path: Path | None = None) -> ImportMapping:
         """Return the mapping of a parsed TOML document.
@@ -164,29 +154,25 @@ class ImportMapping(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omi
             UsageError: When a key is unknown, missing or of the wrong type.
         """
         where = "the mapping" if path is None else str(path)
-        document = _converted(tables, _Document, where)
-        if document.pipeline is None and pipeline is None:
+        document = _convert(tables, _Document, where)
+        name = document.pipeline or pipeline
+        if name is None:
             raise UsageError(f"{where} does not name the pipeline of the log", hint='add pipeline = "NAME"')
-        if document.pipeline is not None and pipeline not in (None, document.pipeline):
-            raise UsageError(
-                f"{where} is for pipeline {document.pipeline!r}, not for {pipeline!r}",
-                hint="name the mapping with --mapping FILE",
-            )
+        if pipeline not in (None, name):
+            raise UsageError(f"{where} is for pipeline {name!r}, not for {pipeline!r}", hint="--mapping FILE names it")
         if not document.nodes:
             raise UsageError(f"{where} has no nodes", hint="add a table [nodes.NAME] for each node; " + _HINT)
+        # Convert table by table, so that an error names the node and the field.
         nodes = {}
-        for name, table in document.nodes.items():
-            at, listed = f"{where}: nodes.{name}", table.get("fields")
-            fields = {
-                field: _converted(how, FieldMapping, f"{at}.fields.{field}")
-                for field, how in (listed.items() if isinstance(listed, dict) else ())
-            }
-            plain = {field: msgspec.to_builtins(how) for field, how in fields.items()}
-            nodes[name] = _converted(table | ({"fields": plain} if fields else {}), NodeMapping, at)
-        return ImportMapping(str(document.pipeline or pipeline), nodes, path)
+        for node, table in document.nodes.items():
+            at, fields = f"{where}: nodes.{node}", table.get("fields")
+            if isinstance(fields, dict):
+                fields = {f: _convert(how, FieldMapping, f"{at}.fields.{f}") for f, how in fields.items()}
+            nodes[node] = _convert({**table, "fields": fields or {}}, NodeMapping, at)
+        return ImportMapping(name, nodes, path)
 
 
-class _Document(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+class _Document(_Table, frozen=True):
     pipeline: str | None = None
     nodes: dict[str, dict[str, Json]] = {}
 
@@ -200,7 +186,6 @@ def load_mapping(path: str | Path, pipeline: str | None = None) -> ImportMapping
     Raises:
         UsageError: When the file does not exist, is not TOML, is no valid mapping, or has an open question.
     """
-    # Read the document, with errors that name the file.
     path = Path(path)
     try:
         text = path.read_text(encoding="utf-8")
@@ -211,27 +196,16 @@ def load_mapping(path: str | Path, pipeline: str | None = None) -> ImportMapping
         raise UsageError(f"the mapping file {path} cannot be read: {error.strerror}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise UsageError(f"{path} is no TOML: {error}", hint=_HINT) from None
-    if question := _OPEN.search(text):
+    if question := _OPEN_QUESTION.search(text):
         line = text.count("\n", 0, question.start()) + 1
         raise UsageError(
-            f"{path} has an open question in line {line}: {text.splitlines()[line - 1].lstrip('# ')}",
+            f"{path} has an open question in line {line}: {question[0].lstrip('# ')}",
             hint=f"put the answer in place of the line, such as {question[1]} = ...",
         )
     return ImportMapping.from_dict(tables, pipeline, path)
 
 
-def positive(value: float, where: str) -> float:
-    """Return ``value``, after checking that it is a finite number above 0.
-
-    Raises:
-        UsageError: When it is not; the message names the place ``where``.
-    """
-    if not 0.0 < value < math.inf:
-        raise UsageError(f"{where} must be above 0, got {value}", hint="it is in samples per second")
-    return value
-
-
-def _converted(table: object, kind: type, where: str):  # noqa: ANN202 - an instance of kind
+def _convert(table: object, kind: type, where: str) -> Any:
     try:
         return msgspec.convert(table, kind)
     except msgspec.ValidationError as error:
@@ -246,37 +220,35 @@ def _converted(table: object, kind: type, where: str):  # noqa: ANN202 - an inst
 def to_toml(
     mapping: ImportMapping,
     comments: Sequence[str] = (),
-    reasons: Mapping[tuple[str, str, str], str] | None = None,
-    questions: Mapping[tuple[str, str, str], str] | None = None,
+    reasons: Mapping[Key, str] | None = None,
+    questions: Mapping[Key, str] | None = None,
 ) -> str:
     """Return a mapping as the text of a mapping file.
 
     Args:
         comments: Lines at the beginning.
-        reasons: (node, field or empty, key) -> evidence for the line of the key.
-        questions: (node, field or empty, key) -> the question, which stands in place of the line of the key.
+        reasons: Evidence for the lines of keys.
+        questions: Questions that stand in place of the lines of keys.
     """
     reasons, questions = reasons or {}, questions or {}
-    lines = [*(f"# {part}" for line in comments for part in _printable(line))]
+    lines = [f"# {part}" for line in comments for part in _printable(line) or [""]]
     lines.append(f"pipeline = {toml_value(mapping.pipeline)}")
 
-    def write(node: str, field: str, table: Mapping[str, Json]) -> None:
-        keys = dict.fromkeys([*table, *(k for n, f, k in questions if (n, f) == (node, field))])
-        for key in keys:
+    def write(head: str, node: str, field: str, table: Mapping[str, Json]) -> None:
+        lines.extend(["", head])
+        for key in dict.fromkeys([*table, *(k for n, f, k in questions if (n, f) == (node, field))]):
             at = node, field, key
             if at in questions:
-                text = " ".join(_printable(questions[at]))
-                lines.append(f"# {key} = {text}")
+                lines.append(f"# {key} = {' '.join(_printable(questions[at]))}")
             else:
                 reason = f"  # {' '.join(_printable(reasons[at]))}" if at in reasons else ""
                 lines.append(f"{key} = {toml_value(table[key])}{reason}")
 
     for name, node in mapping.nodes.items():
-        lines += ["", f"[nodes.{toml_key(name)}]"]
-        write(name, "", {k: v for k, v in msgspec.to_builtins(node).items() if k != "fields"})
+        own = {k: v for k, v in msgspec.to_builtins(node).items() if k != "fields"}
+        write(f"[nodes.{toml_key(name)}]", name, "", own)
         for field, how in node.fields.items():
-            lines += ["", f"[nodes.{toml_key(name)}.fields.{toml_key(field)}]"]
-            write(name, field, msgspec.to_builtins(how))
+            write(f"[nodes.{toml_key(name)}.fields.{toml_key(field)}]", name, field, msgspec.to_builtins(how))
     return "\n".join(lines) + "\n"
 
 
@@ -286,31 +258,30 @@ def toml_value(value: object) -> str:
     Raises:
         UsageError: When it is of another type, or a text has half a character, which names of files can have.
     """
-    if isinstance(value, str):
-        try:
-            value.encode()
-        except UnicodeEncodeError:
-            raise UsageError(
-                f"{value!r} cannot be written: it has bytes that are no text", hint="rename the file or joint"
-            ) from None
-        # TOML has the escapes of JSON, and needs one for DEL.
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, float) and not math.isfinite(value):
-        return "nan" if math.isnan(value) else "inf" if value > 0 else "-inf"
-    if isinstance(value, int | float):
-        return repr(value)
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(map(toml_value, value))}]"
+    match value:
+        case str():
+            try:
+                value.encode()
+            except UnicodeEncodeError:
+                raise UsageError(
+                    f"{value!r} cannot be written: it has bytes that are no text", hint="rename the file or joint"
+                ) from None
+            # TOML has the escapes of JSON, and needs one for DEL.
+            return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+        case bool():
+            return str(value).lower()
+        case int() | float():
+            return repr(value)  # nan, inf and -inf are TOML's
+        case list() | tuple():
+            return f"[{', '.join(map(toml_value, value))}]"
     raise UsageError(f"{value!r} has no form in TOML")
 
 
 def toml_key(key: str) -> str:
     """Return a part of a key, quoted if TOML needs quotes."""
-    return key if _BARE.fullmatch(key) else toml_value(key)
+    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else toml_value(key)
 
 
 def _printable(text: str) -> list[str]:
     """Return the lines of a comment without characters that TOML refuses."""
-    return ["".join(c if c.isprintable() else "?" for c in line) for line in text.splitlines() or [""]]
+    return ["".join(c if c.isprintable() else "?" for c in line) for line in text.splitlines()]

@@ -1,10 +1,20 @@
-"""The meaning of a signal's name in a file of another recorder: side, quantity, unit and joint."""
+"""The meaning of names in a file of another recorder: side, quantity, unit and joint; which columns belong together."""
+
+from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from sim2real.errors import UsageError
+from sim2real.log.importing.mapping import FieldMapping
 from sim2real.types import Json
+
+if TYPE_CHECKING:
+    from sim2real.log.importing.readers import Table
 
 _SIDES = {
     "command": (
@@ -55,21 +65,12 @@ _WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
 
 @dataclass(frozen=True)
 class Meaning:
-    """The meaning of a name; a part is empty if the name lacks it.
+    """The meaning of a name; a part is empty if the name lacks it."""
 
-    Attributes:
-        side: ``command`` or ``measured``.
-        quantity: ``stamp``, ``position``, ``velocity``, ``torque``, ``duty``, ``voltage``, ``kp``, ``kd``,
-            ``enabled``, ``rate``, ``period``, or ``error`` (a difference of two signals).
-        unit: ``rad``, ``deg``, ``rev``, ``mrad``, ``m``, ``mm``, ``counts``, ``percent``, ``s``, ``ms``, ``us``, or
-            ``ns``.
-        label: The remaining words, which name the joint.
-    """
-
-    side: str = ""
-    quantity: str = ""
-    unit: str = ""
-    label: str = ""
+    side: str = ""  # command or measured
+    quantity: str = ""  # a key of the table of quantities
+    unit: str = ""  # a key of the table of units
+    label: str = ""  # the remaining words, which name the joint
 
 
 def meaning(name: str) -> Meaning:
@@ -123,14 +124,13 @@ def about_torque(mapping: Mapping[str, Mapping[str, Json]]) -> list[str]:
     """
     fields = [node["fields"].get("torque") for node in mapping.values()]
     listed = [[f["source"]] if isinstance(f["source"], str) else f["source"] for f in fields if f]
-    sources = [name for names in listed for name in names if meaning(name).side != "command"]
+    sources = [f"'{name}'" for names in listed for name in names if meaning(name).side != "command"]
     if not sources:
         return []
-    shown = ", ".join(f"'{name}'" for name in sources[:3]) + (" ..." if len(sources) > 3 else "")
     return [
-        f"{shown} is taken as the commanded torque, although its name does not mark a command: a measured joint "
-        "torque is no command, as the robot's controller makes it from goals that the model then lacks; import the "
-        "goals, or name a commanded torque cmd_torque"
+        f"{', '.join(sources[:3]) + ' ...' * (len(sources) > 3)} is taken as the commanded torque, although its name "
+        "does not mark a command: a measured joint torque is no command, as the robot's controller makes it from goals "
+        "that the model then lacks; import the goals, or name a commanded torque cmd_torque"
     ]
 
 
@@ -214,3 +214,131 @@ _PART = {
                                     "calf kfe knee lower shank kn tibia"))
     for word in words.split()
 }  # fmt: skip
+
+
+# -- columns that belong together
+
+
+@dataclass(frozen=True)
+class Signal:
+    """Columns that belong together.
+
+    Attributes:
+        sources: Source of each column, as in a mapping.
+        labels: Joint of each column; empty if its name has none.
+        values: Shape ``(N, columns)``; ``(columns,)`` for constants.
+        whole: Source of all columns together; empty if they are separate signals of the file.
+    """
+
+    sources: tuple[str, ...]
+    labels: tuple[str, ...]
+    meaning: Meaning
+    values: np.ndarray
+    whole: str = ""
+
+    @property
+    def name(self) -> str:
+        return self.whole or ", ".join(self.sources[:3]) + " ..." * (len(self.sources) > 3)
+
+    @property
+    def width(self) -> int:
+        return len(self.sources)
+
+    @property
+    def stream(self) -> str:
+        """The topic of a signal in a bag, or the file of one of several; empty for others."""
+        key = self.sources[0]
+        return key.partition(".")[0] if key.startswith("/") else key.partition("/")[0] if "/" in key else ""
+
+    def taken(self, places: Sequence[int]) -> Signal:
+        """Return some of the columns, in this order."""
+        whole = self.whole if list(places) == list(range(self.width)) else ""
+        sources, labels = (tuple(part[i] for i in places) for part in (self.sources, self.labels))
+        return Signal(sources, labels, self.meaning, self.values[..., list(places)], whole)
+
+    def mapped(self, unit: str, **more: Any) -> FieldMapping:
+        """Return the field that has these columns."""
+        return FieldMapping(self.whole or self.sources, unit, shape=(-1,), **more)
+
+
+def collect(table: Table) -> tuple[list[Signal], list[str]]:
+    """Return all signals of numbers with at most two dimensions, and notes on skipped ones.
+
+    Columns whose names differ only by the joint are one signal.
+
+    Raises:
+        UsageError: When a signal with the name of a position or a command cannot be read.
+    """
+    notes: list[str] = []
+    for key, why in table.broken.items():
+        named = _meaning(key, table)
+        # Without such a column, another one could be taken for the positions.
+        if named.quantity == "position" or (named.side and not named.quantity):
+            raise UsageError(f"{key!r} in {table.path} cannot be read: {why}", hint="correct it, or remove the column")
+        notes.append(f"skipped: {key!r}: {why}")
+    lists = {key: words for key, words in table.words.items() if _names_joints(key, words)}
+    if words := [key for key in table.words if key not in lists and len(set(table.words[key])) > 1]:
+        notes.append(f"skipped, as they hold no numbers: {', '.join(words[:20])}")
+    alike: dict[tuple[Meaning, tuple[int, ...], str], list[Signal]] = {}
+    signals: list[Signal] = []
+    for key, raw in table.columns.items():
+        named, values = _meaning(key, table), raw.astype(np.float64)
+        if values.ndim > 2 or (values.ndim == 2 and values.shape[1] > 1000):
+            notes.append(f"skipped: {key!r} has samples of shape {values.shape[1:]}, as images have")
+        elif values.size and not np.isfinite(values).any():
+            notes.append(f"skipped: {key!r} has no number in any sample")
+        elif values.ndim == 2:
+            n = values.shape[1]
+            names = table.names.get(key) or _names_of(key, n, lists, table)
+            labels = tuple(meaning(x).label or x.lower() for x in names) if len(names) == n else ("",) * n
+            signals.append(Signal(tuple(f"{key}[:,{i}]" for i in range(n)), labels, named, values, key))
+        else:
+            row = Signal((key,), (_label(key, named, table),), named, values[..., None])
+            alike.setdefault((replace(named, label=""), values.shape, row.stream), []).append(row)
+    for (named, _, _), rows in alike.items():
+        labels = [row.labels[0] for row in rows]
+        numbered = are_numbers(labels)
+        together = len(set(labels)) == len(labels) > 1 and "" not in labels and named.quantity != "stamp"
+        if not together or not (named.side or named.quantity or numbered):
+            signals += rows
+            continue
+        if numbered:
+            rows.sort(key=lambda row: int(re.findall(r"\d+", row.labels[0])[0]))
+        values = np.concatenate([row.values for row in rows], axis=-1)
+        signals.append(Signal(tuple(r.sources[0] for r in rows), tuple(r.labels[0] for r in rows), named, values))
+    return signals, notes
+
+
+def _meaning(key: str, table: Table) -> Meaning:
+    """Return the meaning of a signal's name; of a file's name only the side counts."""
+    stem = next((stem for stem in table.stems if key.startswith(stem)), "")
+    named = meaning(key[len(stem) :])
+    return named if named.side or not stem else replace(named, side=meaning(stem).side)
+
+
+def _label(key: str, named: Meaning, table: Table) -> str:
+    """Return a column's joint; ``position0`` is that of the name in ``name0``, as rostopic writes it."""
+    if match := re.fullmatch(r"(.*?)[a-z]+(\d+)", key):
+        words = table.words.get(f"{match[1]}name{match[2]}", [])
+        if words and len(set(words)) == 1:
+            return meaning(words[0]).label or words[0].lower()
+    return named.label
+
+
+def _names_joints(key: str, words: Sequence[str]) -> bool:
+    parts = set(re.findall("[a-z]+", key.lower()))
+    wanted = parts & {"names", "joints", "name"} and not parts & {"body", "bodies", "link", "links", "foot", "feet"}
+    return bool(wanted) and len(set(words)) == len(words)
+
+
+def _names_of(key: str, width: int, lists: Mapping[str, list[str]], table: Table) -> list[str]:
+    """Return the names of a signal's columns by the list in the file that shares most words with its name."""
+    words = set(re.findall("[a-z]+", key.lower()))
+    shared = {k: len(set(re.findall("[a-z]+", k.lower())) & words) for k, names in lists.items() if len(names) == width}
+    best = [lists[k] for k, n in shared.items() if n == max(shared.values())]
+    if len({tuple(names) for names in best}) > 1 and meaning(key).quantity in ("", "position"):
+        raise UsageError(
+            f"{', '.join(shared)} in {table.path} name the columns of {key!r} in different orders",
+            hint="remove the list that does not belong to it, or write a mapping with the columns",
+        )
+    return best[0] if best else []

@@ -21,29 +21,30 @@ from sim2real.errors import UsageError
 from sim2real.log.importing.names import is_unit
 from sim2real.types import Json
 
-_COLUMNS = re.compile(r"(.+)\[\s*:\s*,\s*(-?\d+|-?\d*\s*:\s*-?\d*)\s*\]")
 _NULL = frozenset(("", "nan", "null", "none", "n/a", "na", "nil", "-", "--", "?"))
 _BOOL = {"true": 1.0, "false": 0.0}
 _DATE = re.compile(r"(\d{4}-\d\d-\d\d[T ])?\d\d:\d\d(:\d\d(\.\d+)?)?(Z|[+-]\d\d:?\d\d)?")
+_COMMENT = re.compile(r"\s*(#|%|//)+\s*")
 _WHOLE = "check that the file is complete"
 _DAMAGED = (OSError, ValueError, EOFError, LookupError, MemoryError, RuntimeError, zipfile.BadZipFile, zlib.error)
-_OTHERS = (
-    (
-        b"SQLite format 3\0",
-        "a SQLite bag (.db3)",
-        "ros2 bag convert -i BAG -o out.yaml, with storage_id: mcap in out.yaml",
+_PICKLE = "a Python pickle, which could run code", "np.savez in the program that wrote it"
+_OTHERS = {
+    b"SQLite format 3\0": (
+        "a SQLite bag (.db3)", "ros2 bag convert -i BAG -o out.yaml, with storage_id: mcap in out.yaml"
     ),
-    (b"#ROSBAG V", "a ROS 1 bag", "rosbags-convert --src run.bag --dst run --dst-storage mcap (pip install rosbags)"),
-    (b"\x28\xb5\x2f\xfd", "compressed by zstd", "zstd -d FILE"),
-    (b"\x1f\x8b", "compressed by gzip", "gunzip FILE"),
-    (b"\x89HDF", "HDF5", "h5py: np.savez('run.npz', **{k: f[k][()] for k in f})"),
-    (b"MATLAB 5.0", "a MATLAB file", "scipy: np.savez('run.npz', **scipy.io.loadmat(FILE))"),
-    (b"ULog\x01", "a PX4 log", "ulog2csv FILE (pip install pyulog)"),
-    (b"\x93NUMPY", "a single array without names", "numpy: np.savez('run.npz', t_s=..., q_rad=..., goal_rad=...)"),
-    (b"ARROW1", "an Arrow file", "pandas: pd.read_feather(FILE).to_csv('run.csv', index=False)"),
-    (b"\x80\x04", "a Python pickle, which could run code", "np.savez in the program that wrote it"),
-    (b"\x80\x05", "a Python pickle, which could run code", "np.savez in the program that wrote it"),
-)
+    b"#ROSBAG V": (
+        "a ROS 1 bag", "rosbags-convert --src run.bag --dst run --dst-storage mcap (pip install rosbags)"
+    ),
+    b"\x28\xb5\x2f\xfd": ("compressed by zstd", "zstd -d FILE"),
+    b"\x1f\x8b": ("compressed by gzip", "gunzip FILE"),
+    b"\x89HDF": ("HDF5", "h5py: np.savez('run.npz', **{k: f[k][()] for k in f})"),
+    b"MATLAB 5.0": ("a MATLAB file", "scipy: np.savez('run.npz', **scipy.io.loadmat(FILE))"),
+    b"ULog\x01": ("a PX4 log", "ulog2csv FILE (pip install pyulog)"),
+    b"\x93NUMPY": ("a single array without names", "numpy: np.savez('run.npz', t_s=..., q_rad=..., goal_rad=...)"),
+    b"ARROW1": ("an Arrow file", "pandas: pd.read_feather(FILE).to_csv('run.csv', index=False)"),
+    b"\x80\x04": _PICKLE,
+    b"\x80\x05": _PICKLE,
+}  # fmt: skip
 """First bytes -> what the file is, and the command that converts it."""
 
 
@@ -91,13 +92,13 @@ class Table:
         except (TypeError, ValueError, OverflowError):
             flat = raw if isinstance(raw, list | np.ndarray) else [raw]
             if all(v is None or isinstance(v, str) for v in flat):
-                self._add_texts(name, ["" if v is None else str(v) for v in flat])
+                self.add_texts(name, ["" if v is None else str(v) for v in flat])
             else:
                 self.broken[name] = "its samples are not numbers of one shape"
             return
         kind = values.dtype.kind
         if kind == "U" and values.ndim <= 1:
-            self._add_texts(name, [str(v) for v in np.atleast_1d(values)])
+            self.add_texts(name, [str(v) for v in np.atleast_1d(values)])
         elif kind in "Mm":
             nanoseconds = values.astype(f"{kind}8[ns]").astype(np.int64)
             self.columns[name] = (
@@ -110,10 +111,12 @@ class Table:
         else:
             self.broken[name] = f"it holds no numbers, but {values.dtype}"
 
-    def _add_texts(self, name: str, texts: list[str]) -> None:
+    def add_texts(self, name: str, texts: list[str], lines: Sequence[int] = ()) -> None:
+        """Add a signal that is written as texts: numbers, dates or words, at these lines of a file."""
         column = numbers(texts)
         if isinstance(column, str):
-            self.broken[name] = column
+            where = f"line {lines[texts.index(column)]}" if lines else "it"
+            self.broken[name] = f"{where} has the word {column!r} among its numbers"
         elif column is None:
             self.words[name] = texts
         else:
@@ -129,9 +132,10 @@ class Table:
             UsageError: When the signal or column does not exist, or holds other values than numbers.
         """
         name, chosen = source, None
-        if source not in self.columns and (match := _COLUMNS.fullmatch(source)):
-            name, text = match[1], match[2]
-            parts = [int(part) if part.strip() else None for part in text.split(":")]
+        match = re.fullmatch(r"(.+)\[\s*:\s*,\s*(-?\d+|-?\d*\s*:\s*-?\d*)\s*\]", source)
+        if source not in self.columns and match:
+            name = match[1]
+            parts = [int(part) if part.strip() else None for part in match[2].split(":")]
             chosen = slice(*parts) if len(parts) > 1 else parts[0]
         if name not in self.columns:
             if name in self.broken or name in self.words:
@@ -169,10 +173,8 @@ def open_tables(path: Path, episode: int | None = None) -> list[Table]:
     """
     from sim2real.log.importing import bags, lerobot  # imported late: they need their packages
 
-    if path.is_dir() and (path / lerobot.INFO).is_file():
-        return lerobot.read_lerobot(path, episode)
     if path.is_dir():
-        return [bags.read_bag(path)]
+        return lerobot.read_lerobot(path, episode) if (path / lerobot.INFO).is_file() else [bags.read_bag(path)]
     if not path.is_file():
         why = "it is a pipe or a device" if path.exists() else "there is no such file"
         raise UsageError(f"cannot read {path}: {why}", hint="check its name")
@@ -185,33 +187,28 @@ def open_tables(path: Path, episode: int | None = None) -> list[Table]:
         return lerobot.read_lerobot(path, episode)
     if episode is not None:
         raise UsageError(f"{path} is no data set of LeRobot: it has no episodes", hint="remove --episode")
-    return [bags.read_bag(path) if head[:5] == b"\x89MCAP" else _read_one(path, head)]
+    refuse_container(path, head)
+    if not head:
+        raise UsageError(f"{path} is empty", hint=_WHOLE)
+    if head[:5] == b"\x89MCAP":
+        return [bags.read_bag(path)]
+    if head[:2] == b"PK":
+        return [_read_npz(path)]
+    if b"\0" in head:
+        is_utf_16 = head[:2] in (b"\xff\xfe", b"\xfe\xff") or head[1::2].count(0) > len(head) // 4
+        raise UsageError(
+            f"{path} is {'UTF-16 text' if is_utf_16 else 'binary'}, which import does not read",
+            hint="save it as UTF-8 CSV, JSON, npz, Parquet or MCAP",
+        )
+    text = path.read_text(encoding="utf-8-sig", errors="replace")
+    return [_read_json(path, text) if text.lstrip()[:1] in ("{", "[") else _read_csv(path, text)]
 
 
 def refuse_container(path: Path, head: bytes) -> None:
     """Raise an error for a container of another kind, which names the command that converts it."""
-    for magic, what, command in _OTHERS:
+    for magic, (what, command) in _OTHERS.items():
         if head.startswith(magic):
             raise UsageError(f"{path} is {what}, which import does not read", hint=f"convert it: {command}")
-
-
-def _read_one(path: Path, head: bytes) -> Table:
-    refuse_container(path, head)
-    if not head:
-        raise UsageError(f"{path} is empty", hint=_WHOLE)
-    if head[:2] == b"PK":
-        return _read_npz(path)
-    if b"\0" in head:
-        what = (
-            "UTF-16 text"
-            if head[:2] in (b"\xff\xfe", b"\xfe\xff") or head[1::2].count(0) > len(head) // 4
-            else "binary"
-        )
-        raise UsageError(
-            f"{path} is {what}, which import does not read", hint="save it as UTF-8 CSV, JSON, npz, Parquet or MCAP"
-        )
-    text = path.read_text(encoding="utf-8-sig", errors="replace")
-    return _read_json(path, text) if text.lstrip()[:1] in ("{", "[") else _read_csv(path, text)
 
 
 def _read_npz(path: Path) -> Table:
@@ -225,11 +222,8 @@ def _read_npz(path: Path) -> Table:
                     pickled = "it holds Python objects, which are never loaded"
                     table.broken[name] = pickled if "pickle" in str(error) else f"it is damaged ({error})"
                     continue
-                if values.dtype.names:
-                    for column in values.dtype.names:
-                        table.add(f"{name}.{column}", values[column])
-                else:
-                    table.add(name, values)
+                for column in values.dtype.names or ("",):
+                    table.add(f"{name}.{column}" if column else name, values[column] if column else values)
     except _DAMAGED as error:
         raise UsageError(f"{path} is no npz, or is cut off: {error}", hint=_WHOLE) from None
     return table
@@ -242,15 +236,10 @@ def _read_json(path: Path, text: str) -> Table:
             document: Json = json.loads(text)
         except json.JSONDecodeError:
             document = [json.loads(line) for line in text.splitlines() if line.strip()]  # an object on each line
-    except (ValueError, RecursionError) as error:
-        raise UsageError(f"{path} is no JSON, or is cut off: {error}", hint=_WHOLE) from None
-    if isinstance(document, list):
-        document = {"": document}
-    try:
-        for name, value in _leaves(document, path):
+        for name, value in _leaves({"": document} if isinstance(document, list) else document, path):
             table.add(name, value)
-    except RecursionError:
-        raise UsageError(f"{path} is nested too deeply", hint=_WHOLE) from None
+    except (ValueError, RecursionError) as error:
+        raise UsageError(f"{path} is no JSON, is cut off, or nested too deeply: {error}", hint=_WHOLE) from None
     if not table.keys:
         raise UsageError(f"{path} holds no signals", hint=_WHOLE)
     return table
@@ -264,12 +253,9 @@ def _leaves(value: Json, path: Path, trail: str = "") -> Iterator[tuple[str, Jso
     elif isinstance(value, list) and value and isinstance(value[0], dict):
         rows = [dict(_leaves(item, path)) if isinstance(item, dict) else {} for item in value]
         for key in rows[0]:
-            missing = next((i for i, row in enumerate(rows) if key not in row), None)
-            if missing is not None:
-                raise UsageError(
-                    f"element {missing} of {trail or 'the list'} in {path} has no {key!r}, unlike those before it",
-                    hint=_WHOLE,
-                )
+            if (missing := next((i for i, row in enumerate(rows) if key not in row), None)) is not None:
+                text = f"element {missing} of {trail or 'the list'} in {path} has no {key!r}, unlike those before it"
+                raise UsageError(text, hint=_WHOLE)
             yield f"{trail}[].{key}", [row[key] for row in rows]
     elif trail:
         yield trail, value
@@ -278,10 +264,8 @@ def _leaves(value: Json, path: Path, trail: str = "") -> Iterator[tuple[str, Jso
 def _read_csv(path: Path, text: str) -> Table:
     """Read a text with separators: the line before the first numbers has the names, also if it is a comment."""
     table = Table(path, "csv")
-    lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
-    if lines and re.fullmatch(r"sep=.", lines[0][1].strip()):
-        lines = lines[1:]
-    body = [(i, line) for i, line in lines if not _is_comment(line)]
+    lines = [(i, x) for i, x in enumerate(text.splitlines(), 1) if x.strip() and not re.fullmatch("sep=.", x.strip())]
+    body = [(i, line) for i, line in lines if not _COMMENT.match(line)]
     separator = _separator([line for _, line in body[:50]])
     rows = [(i, _cells(line, separator)) for i, line in body]
     counts = Counter(len(cells) for _, cells in rows)
@@ -290,13 +274,16 @@ def _read_csv(path: Path, text: str) -> Table:
     first = next((k for k, (_, c) in enumerate(rows) if len(c) == width and any(map(_is_number, c))), None)
     if first is None:
         raise UsageError(f"{path} holds no line of numbers", hint="it needs a line of names, then lines of numbers")
-    begin, data = rows[first][0], rows[first:]
-    names, first_line = _header(path, lines, rows[:first], data, separator, width)
+    data = rows[first:]
+    begin = data[0][0]
+    names, at = _names([(i, line) for i, line in lines if i < begin], separator, width)
+    if why := _is_unclear(data, width, names is None, first > 0):
+        raise UsageError(f"line {begin} of {path} {why}", hint="give each column a name in the line before the numbers")
     if names is None:
-        names = [str(i) for i in range(width)]
         table.notes.append(f"{path.name} has no line of names: its columns are numbered from 0")
-    elif skipped := [i for i, _ in lines if i < first_line]:
-        table.notes.append(f"skipped: {len(skipped)} lines before the names in line {first_line}")
+        names = [str(i) for i in range(width)]
+    elif skipped := [i for i, _ in lines if i < at]:
+        table.notes.append(f"skipped: {len(skipped)} lines before the names in line {at}")
     if len(data) > 1 and (len(data[-1][1]) < width or not text.endswith(("\n", "\r"))):
         # A number that was cut is another number.
         table.notes.append(f"the last line of {path.name} has no end: it is left out")
@@ -307,120 +294,80 @@ def _read_csv(path: Path, text: str) -> Table:
     if len(names) > 1 and not names[-1] and not any(columns[-1]):  # each line ends with a separator
         names, columns = names[:-1], columns[:-1]
     names = [name or f"column {i}" for i, name in enumerate(names)]
-    if len(set(names)) < len(names):
-        twice = next(name for name, n in Counter(names).items() if n > 1)
-        raise UsageError(f"more than one column of {path} is named {twice!r}", hint="rename one of them")
-    comma = separator != "," and any(re.fullmatch(r"[-+]?\d+,\d+(e[-+]?\d+)?", c.strip()) for c in rows[first][1])
+    if twice := [name for name, n in Counter(names).items() if n > 1]:
+        raise UsageError(f"more than one column of {path} is named {twice[0]!r}", hint="rename one of them")
+    comma = separator != "," and any(re.fullmatch(r"[-+]?\d+,\d+(e[-+]?\d+)?", c.strip()) for c in data[0][1])
     for name, cells in zip(names, columns, strict=True):
         texts = [c.replace(",", ".") for c in cells] if comma else list(cells)
-        column = numbers(texts)
-        if isinstance(column, str):
-            line = next(i for (i, _), c in zip(data, texts, strict=True) if c == column)
-            table.broken[name] = f"line {line} has the word {column!r} among its numbers"
-        elif column is None:
-            table.words[name] = texts
-        else:
-            table.columns[name] = column
+        table.add_texts(name, texts, [i for i, _ in data])
     return table
 
 
-def _header(
-    path: Path,
-    lines: Sequence[tuple[int, str]],
-    before: Sequence[tuple[int, list[str]]],
-    data: Sequence[tuple[int, list[str]]],
-    separator: str | None,
-    width: int,
-) -> tuple[list[str] | None, int]:
+def _is_unclear(data: Sequence[tuple[int, list[str]]], width: int, is_nameless: bool, has_words: bool) -> str:
+    """Return why the first row may be the names of the columns, or a sample; empty if it is clear."""
+    first, below = data[0][1], [cells for _, cells in data[1:20] if len(cells) == width]
+    for i, cell in enumerate(first):
+        # A word above numbers; where words follow below, the column holds words.
+        is_word = not _is_number(cell) and cell.strip().lower() not in _NULL
+        if is_word and below and all(_is_number(cells[i]) for cells in below):
+            return f"mixes numbers with {cell.strip()!r}, above numbers: is it a line of names, or a damaged sample?"
+    counting = [str(i) for i in range(width)]
+    if is_nameless and has_words:
+        return f"begins {width} columns of numbers, and the line before it has other names"
+    if is_nameless and width > 1 and [c.strip() for c in first] in (counting, ["", *counting[:-1]]):
+        return "counts its columns: is it a line of names, or a sample?"
+    return ""
+
+
+def _names(above: Sequence[tuple[int, str]], separator: str | None, width: int) -> tuple[list[str] | None, int]:
     """Return the names of the columns, None without any, and the number of their line."""
-    begin, first = data[0]
-    # A first row of numbers with a word in it is either: refuse it, unless words also follow below.
-    words = [i for i, cell in enumerate(first) if not _is_number(cell) and cell.strip().lower() not in _NULL]
-    below = [cells for _, cells in data[1:20] if len(cells) == width]
-    odd = [i for i in words if below and all(_is_number(cells[i]) for cells in below)]
-    if odd:
-        raise UsageError(
-            f"line {begin} of {path} mixes numbers with {first[odd[0]].strip()!r}, below which numbers follow: it may "
-            "be the names of the columns or a damaged sample",
-            hint="give each column a name in the first line, or remove the line",
-        )
-    above = [(i, line) for i, line in lines if i < begin]
-    units: list[str] = []
+    units: tuple[list[str], int] | None = None
     for i, line in reversed(above):
-        text = re.sub(r"^\s*(#|%|//)+\s*", "", line)
-        cells = [c.strip() for c in _cells(text, separator)]
-        for other in (",", None):  # the line of names may be separated in another way
-            cells = cells if len(cells) == width else [c.strip() for c in _cells(text, other)]
-        if len(cells) != width or not any(cells):
+        text = _COMMENT.sub("", line, count=1) if _COMMENT.match(line) else line
+        # The line of names may be separated in another way than the numbers.
+        split = [[c.strip() for c in _cells(text, by)] for by in (separator, ",", None)]
+        cells = next((cells for cells in split if len(cells) == width and any(cells)), None)
+        if cells is None:
             # A line of another width is text, and above it there are no names.
-            if not _is_comment(line):
+            if not _COMMENT.match(line):
                 break
-            continue
-        if not units and all(not c or is_unit(c) for c in cells) and len(above) > 1:
-            units = cells
-            continue
-        return [
-            f"{name} [{unit}]" if unit else name for name, unit in zip(cells, units or [""] * width, strict=True)
-        ], i
-    if units:
-        return units, begin
-    if before:
-        raise UsageError(
-            f"line {before[-1][0]} of {path} has {len(before[-1][1])} cells for {width} columns of numbers: it names "
-            "other ones", hint="give each column a name in the line before the numbers"
-        )  # fmt: skip
-    if width > 1 and [c.strip() for c in first] in ([str(i) for i in range(width)], ["", *map(str, range(width - 1))]):
-        raise UsageError(
-            f"line {begin} of {path} counts its columns: it may be the names of the columns or a sample",
-            hint="give each column a name in the first line, such as t_s, q_rad, goal_rad",
-        )
-    return None, begin
+        elif units is None and len(above) > 1 and all(not c or is_unit(c) for c in cells):
+            units = cells, i
+        elif units is None:
+            return cells, i
+        else:
+            return [f"{name} [{unit}]" if unit else name for name, unit in zip(cells, units[0], strict=True)], i
+    return units or (None, 0)
 
 
 def numbers(texts: Sequence[str]) -> np.ndarray | str | None:
     """Return texts as numbers, dates as nanoseconds since 1970; a word among numbers; None for words alone."""
-    try:
-        return np.array([int(t) for t in texts], np.int64)
-    except (ValueError, OverflowError):
-        pass
-    try:
-        return np.array([float(t) for t in texts])
-    except ValueError:
-        pass
-    stripped = [t.strip().lower() for t in texts]
-    if _DATE.fullmatch(next((t.strip() for t in texts if t.strip().lower() not in _NULL), "")):
-        return _dates(texts)
-    values, words = np.full(len(texts), np.nan), []
-    for i, t in enumerate(stripped):
-        if t in _BOOL:
-            values[i] = _BOOL[t]
-        elif t not in _NULL:
-            try:
-                values[i] = float(t)
-            except ValueError:
-                words.append(texts[i])
-    if not words:
-        return values
-    return words[0] if np.isfinite(values).any() else None
-
-
-def _dates(texts: Sequence[str]) -> np.ndarray | str:
-    """Return dates as nanoseconds since 1970; without a zone they are in UTC."""
-    moments = []
-    for text in texts:
-        whole = text.strip() if "-" in text[:5] else f"1970-01-01T{text.strip()}"
+    for kind in (int, float):
         try:
-            moment = datetime.fromisoformat(re.sub(r"(\.\d{6})\d+", r"\1", whole))
+            return np.array([kind(t) for t in texts], np.int64 if kind is int else np.float64)
+        except (ValueError, OverflowError):
+            pass
+    stripped = [t.strip().lower() for t in texts]
+    is_date = _DATE.fullmatch(next((t.strip() for t in texts if t.strip().lower() not in _NULL), ""))
+    values, words = [], []
+    for text, word in zip(texts, stripped, strict=True):
+        try:
+            if is_date:
+                values.append(_nanoseconds(text.strip()))
+            else:
+                values.append(np.nan if word in _NULL else _BOOL[word] if word in _BOOL else float(word))
         except ValueError:
-            return text
-        moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
-        since = moment - datetime(1970, 1, 1, tzinfo=UTC)
-        moments.append(((since.days * 86400 + since.seconds) * 1_000_000 + since.microseconds) * 1000)
-    return np.array(moments, np.int64)
+            words.append(text)
+    if not words:
+        return np.array(values)
+    return words[0] if is_date or np.isfinite(values).any() else None
 
 
-def _is_comment(line: str) -> bool:
-    return line.lstrip().startswith(("#", "%", "//"))
+def _nanoseconds(text: str) -> int:
+    """Return a date as nanoseconds since 1970; without a zone it is in UTC."""
+    moment = datetime.fromisoformat(text if "-" in text[:5] else f"1970-01-01T{text}")
+    since = (moment if moment.tzinfo else moment.replace(tzinfo=UTC)) - datetime(1970, 1, 1, tzinfo=UTC)
+    return ((since.days * 86400 + since.seconds) * 1_000_000 + since.microseconds) * 1000
 
 
 def _is_number(cell: str) -> bool:

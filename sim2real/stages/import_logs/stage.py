@@ -12,9 +12,8 @@ from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
 from sim2real.log.importing import checks, importer
 from sim2real.log.importing.mapping import MAPPING, ImportMapping, load_mapping
-from sim2real.log.importing.propose import propose
+from sim2real.log.importing.propose import ImportHints, Proposal, propose
 from sim2real.log.importing.readers import Table, joined, open_tables
-from sim2real.log.importing.signals import ImportHints, Proposal
 from sim2real.robots.model.drives import joints_of, slides_of
 from sim2real.robots.model.file import read_model
 from sim2real.robots.model.robot import MjcfRobot
@@ -63,7 +62,8 @@ def run(config: ImportConfig) -> None:
                 (written := config.out.with_suffix(".import.toml")).write_text(text, encoding="utf-8")
         else:
             beside = (path for table in tables[:1] for path in table.beside)
-            inputs = mapping.inputs(tables[0].path) | {f"source_{i}": p for i, p in enumerate(beside, 1)}
+            inputs = {"source": tables[0].path} | {f"source_{i}": p for i, p in enumerate(beside, 1)}
+            inputs |= {"mapping": mapping.path} if mapping.path else {}
             with run_folder.open_stage(config.runs, mapping.pipeline, "record", config, inputs) as stage:
                 for i, episode in enumerate(episodes):
                     log = stage.output("log" if not i else f"log_{i}", f"session{f'_{i}' if i else ''}.mcap")

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from sim2real.errors import UsageError
@@ -73,7 +74,7 @@ def describe_robot(flags: RobotFlags, logs: Sequence[str]) -> Described:
         mapping, episode = None, read_log(first)
         name = str(episode.metadata.get("pipeline") or name)
     elif flags.mapping is not None:
-        mapping = load_mapping(flags.mapping, name).of_joints()
+        mapping = _of_joints(load_mapping(flags.mapping, name))
         episode = import_table(_table(first), mapping)
         import_logs_stage.refuse_contradictions(first, episode, flags.as_told)
     else:
@@ -86,6 +87,16 @@ def describe_robot(flags: RobotFlags, logs: Sequence[str]) -> Described:
     description = _description(flags, model, episode)
     note_held(description)
     return Described(name, description, mapping)
+
+
+def _of_joints(mapping: ImportMapping) -> ImportMapping:
+    """Return a mapping with a vector for each field, as joints have it."""
+    replaced = msgspec.structs.replace
+    nodes = {
+        name: replaced(n, fields={k: replaced(f, shape=f.shape or (-1,)) for k, f in n.fields.items()})
+        for name, n in mapping.nodes.items()
+    }
+    return replaced(mapping, nodes=nodes)
 
 
 def _table(path: Path) -> Table:
