@@ -95,7 +95,15 @@ def test_other_parquet_files_are_tables(tmp_path):
     pq.write_table(pa.table({"t_s": np.arange(len(q)) / sets.FPS, **names}), tmp_path / "run.pq")
     (table,) = open_tables(tmp_path / "run.pq")
     found = propose(table, ImportHints("arm"))
+    assert found.mapping.nodes["sensor"].stamps == "t_s"
     np.testing.assert_allclose(import_table(table, found.mapping).outputs["sensor"]["position"], q)
     (tmp_path / "cut.parquet").write_bytes((tmp_path / "run.pq").read_bytes()[:300])
     with pytest.raises(UsageError, match="cut off"):
         open_tables(tmp_path / "cut.parquet")
+
+
+def test_without_pyarrow_the_error_names_it(tmp_path, monkeypatch):
+    data_set(tmp_path / "set", in_unit("deg"))
+    monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
+    with pytest.raises(UsageError, match=r"needs pyarrow\n\nhint: pip install 'pyarrow"):
+        open_tables(tmp_path / "set")

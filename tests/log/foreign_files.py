@@ -52,11 +52,3 @@ def records(path: Path) -> Path:
     ]
     path.write_text(json.dumps({"meta": {"kp": 7}, "motor": "m1", "entries": entries}))
     return path
-
-
-def csv(path: Path, delimiter: str = ",") -> Path:
-    """Write CSV with stamps in whole microseconds."""
-    rows = [["t_us", "u", "joint 1", "joint 2"]]
-    rows += [[str(int(t)), repr(float(u)), *map(repr, q.tolist())] for t, u, q in zip(STAMPS_US, U, Q, strict=True)]
-    path.write_text("\n".join(delimiter.join(row) for row in rows) + "\n")
-    return path

@@ -2,8 +2,6 @@
 
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import foreign_files
@@ -98,18 +96,6 @@ def test_wrong_commands_exit_2_and_leave_no_run(workplace, capsys, arguments, na
     assert not Path("runs").exists()
 
 
-def test_help_says_all_flags_and_imports_nothing_heavy():
-    code = "import sys; from sim2real import cli; cli.main(['import', '--help-all'])"
-    heavy = "print(sorted({'jax', 'numpy', 'mujoco'} & set(sys.modules)))"
-    command = [sys.executable, "-c", f"{code}; {heavy}"]
-    lines = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout.splitlines()
-    assert lines[-1] == "[]"
-    text = "\n".join(lines)
-    assert "usage: sim2real import" in text
-    for flag in ("--mapping", "--pipeline", "--unit", "--samples", "--out", "--runs", "FILE"):
-        assert flag in text
-
-
 def public(name):
     """Return a file of the public data sets; without them the test is skipped."""
     if not (DATA / name).exists():
@@ -155,15 +141,6 @@ def test_sages_so101(tmp_path):
         np.testing.assert_array_equal(episode.outputs["sensor"]["velocity"], data["dq_rad_s"])
         np.testing.assert_array_equal(episode.steps["sensor"].start, np.rint(1e6 * data["t_meas_s"]))
     assert episode.outputs["sensor"]["position"].shape == (5200, 6)
-
-
-@pytest.mark.parametrize("pipeline", ["disk", "xl330", "so101_log"])
-def test_the_pipelines_mappings_are_for_them(pipeline):
-    from sim2real.log import load_mapping
-
-    mapping = load_mapping(REPOSITORY / "pipelines" / pipeline / "import.toml")
-    assert mapping.pipeline == pipeline
-    assert set(mapping.nodes) == {"actuator", "sensor"}
 
 
 def test_a_mapping_cannot_lead_out_of_the_folder_of_runs(tmp_path, capsys):

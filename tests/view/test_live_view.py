@@ -66,6 +66,7 @@ def test_without_a_screen_the_recording_goes_on_and_names_another_viewer(tmp_pat
     said = capsys.readouterr().err
     assert "no live view: this computer has no screen" in said
     assert "--view web" in said
+    assert said.count("hint: ") == 1
 
 
 def test_the_flag_takes_a_viewer():

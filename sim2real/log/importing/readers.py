@@ -238,6 +238,8 @@ def _read_json(path: Path, text: str) -> Table:
             document = [json.loads(line) for line in text.splitlines() if line.strip()]  # an object on each line
         for name, value in _leaves({"": document} if isinstance(document, list) else document, path):
             table.add(name, value)
+    except UsageError:
+        raise
     except (ValueError, RecursionError) as error:
         raise UsageError(f"{path} is no JSON, is cut off, or nested too deeply: {error}", hint=_WHOLE) from None
     if not table.keys:
