@@ -324,7 +324,7 @@ def _plausible(table: Table, name: str, field: str, node: NodeMapping, own: _Str
             f"faster than a joint can, in {int(leapt.any(axis=1).sum())} samples",
             hint='implausible = "drop" in the mapping skips such samples',
         )
-    good = ~leapt.any(axis=1)
+    good = np.asarray(~leapt.any(axis=1))
     # A jump without return means another zero, another unit or missing samples.
     if (jump := checks.leap(t_s[good], angle[good])) is not None:
         k, i, size = jump

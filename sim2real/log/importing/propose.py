@@ -196,7 +196,7 @@ class _Proposer:
         """Return the column of each joint of the robot, and the joints' names."""
         labels, joints, at = measured.labels, self.hints.joints, ("sensor", "position", "source")
         if not joints:
-            finite = np.isfinite(measured.values).any(axis=0)
+            finite = np.asarray(np.isfinite(measured.values).any(axis=0))
             if empty := [source for source, good in zip(measured.sources, finite, strict=True) if not good]:
                 self.evidence.append(f"skipped: {', '.join(empty)} has no number in any sample")
             kept = np.flatnonzero(finite).tolist()
