@@ -21,7 +21,7 @@ test: $(READY)
 	$(BIN)/ruff format --check
 	$(BIN)/lint-imports --no-cache --no-logo
 	$(BIN)/pyright --threads 2
-	$(PYTEST) -m "not process and not night" --numprocesses 2 --dist loadfile
+	$(PYTEST) -m "not process and not night" --numprocesses 2 --dist loadfile --no-loadscope-reorder
 	$(PROCESS) || $(PROCESS) --last-failed --last-failed-no-failures none
 
 # What blocks nothing: long tests, those that depend on chance, and drawn examples from a new seed, on which no test ends

@@ -9,12 +9,13 @@ import pytest
 from test_doctor_contract import network
 
 from sim2real import cli
+from sim2real.doctor import plant
 from sim2real.doctor.contract import Contract, Term, contract_facts, contract_toml
 from sim2real.doctor.log import read_deployment
 from sim2real.doctor.plant import Drives, driven_joints, solve_plant
 from sim2real.doctor.timing import solve_timing
 
-XML = """<mujoco><option timestep="0.001"/><worldbody><body>
+XML = """<mujoco><option timestep="0.0025"/><worldbody><body>
 <joint name="a" axis="0 1 0" damping="0.01" armature="0.003"/>
 <geom type="capsule" size="0.01" fromto="0 0 0 0 0 -0.3" mass="0.4"/><body pos="0 0 -0.3"><joint name="b" axis="0 1 0"
 damping="0.01" armature="0.003"/><geom type="capsule" size="0.01" fromto="0 0 0 0 0 -0.2" mass="0.2"/></body></body>
@@ -24,9 +25,15 @@ CONTRACT = Contract(
 )
 
 
+@pytest.fixture(autouse=True)
+def few_windows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Replay a third of the windows, which takes a third of the time."""
+    monkeypatch.setattr(plant, "_WINDOWS", 13)
+
+
 def recorded(folder: Path, kp: float = 1.0, limit: float = 1e6, delay_s: float = 0.01, rate: float = 50.0) -> Path:
     """Write the log of a robot with its own loop of control; the targets are leaps and waves."""
-    model = mujoco.MjModel.from_xml_string(XML.replace('0.4"', '0.41"'))
+    model = mujoco.MjModel.from_xml_string(XML.replace('0.4"', '0.41"').replace("0.0025", "0.001"))
     data, rng = mujoco.MjData(model), np.random.default_rng(1)
     rows: dict[str, list] = {"t": [], "q": [], "dq": [], "target": []}
     waiting, goal = [(0.0, np.zeros(2))], np.zeros(2)

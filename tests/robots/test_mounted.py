@@ -12,28 +12,15 @@ from sim2real.emulation.truth import Kind, read_truth
 from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.joint import Joint
 from sim2real.hardware.safety.limits import GateLimits
-from sim2real.identification.fit import fit
-from sim2real.identification.segments import Span
 from sim2real.log.reader import read_log
 from sim2real.stages.config import RecordConfig
-from sim2real.stages.load import load_robot
 from sim2real.stages.session.episode import Bench
-from sim2real.stages.session.excitation import excitation
 
 PATIENT = GateLimits(command_timeout_s=0.2, servo_watchdog_s=0.6)
 GEARS = (2.0, 0.5)
 
 
 GEARED = replace(SERVOS, joints=(Joint("left", 0.3, -1, GEARS[0]), Joint("right", gear=GEARS[1])))
-
-
-def test_a_robots_joints_are_called_as_before(pair):
-    robot = PairRobot(GEARED)
-    assert (robot.drive.servos.names, pair.drive.servos.names) == (("left", "right"),) * 2
-    assert robot.sensor.joints == pair.sensor.joints
-    assert [p.name for p in robot.model.dynamics()] == [p.name for p in pair.model.dynamics()]
-    assert robot.agent.action == pair.agent.action
-    assert robot.drive.gate(PATIENT).joints == ("left", "right")
 
 
 def test_a_twins_servos_are_those_of_the_data_sheet_whatever_their_gears(pair):
@@ -64,27 +51,3 @@ def test_goals_and_limits_are_the_joints_on_the_bus_too(arm, tmp_path, virtual_r
         goals = truth.of(Kind.EFFECT, i + 1)["values"]
         sent = goals[goals[:, 0] == OperatingMode.POSITION][-1, 1] - np.pi
         assert sent == pytest.approx(joint.encoder(goal[i]), abs=0.001)
-
-
-@pytest.mark.night  # test_mounting.py has each reading and command, the test above goals and limits
-def test_what_is_identified_does_not_depend_on_how_the_joint_is_mounted(tmp_path, virtual_robots):
-    """The log of a pendulum whose motor turns twice the other way gives the parameters of the pendulum's plant."""
-    pipeline = load_robot("pendulum")
-    robot = type(pipeline)((Joint("hinge", 0.7, -1, 2.0),))
-    config = RecordConfig(duration_s=8.0, amplitude=2.0, low_hz=0.7, high_hz=2.0, gate=PATIENT)
-    log, truth = tmp_path / "log.mcap", tmp_path / "truth.bin"
-    with robot.drive.connect("embedded", PATIENT, truth, 1) as session:
-        nodes = robot.recording_nodes(session, excitation(config, 50.0, 1))
-        Bench(robot, session, config).run_episode(nodes, {}, log, config.duration_s, "record")
-    episode, true = read_log(log), read_truth(truth)
-    assert np.ptp(episode.outputs["sensor"]["th"]) > 1.0
-    samples = true.of(Kind.SAMPLE)["values"]
-    np.testing.assert_allclose(samples[0, 0], 0.7 - 2.0 * np.pi, atol=1e-6)  # that is what the encoder says at pi
-    how = replace(pipeline.defaults.identify, generations=0, initial_state="measured")
-    spans = [Span(0, begin_s) for begin_s in (0.3, 2.0, 3.7, 5.4)]
-    found = fit(robot.identifiable(0.06), [episode], spans, 1.5, how).values
-    # A wrong mounting is a factor of 2 or 4.
-    known = {"damping": 0.1, "friction": 0.08}
-    for name, value in true.parameters.items():
-        assert found[name] == pytest.approx(value, rel=known.get(name, 0.03)), name
-    assert found["sensor_delay"] + found["actuator_delay"] == pytest.approx(0.045, abs=0.004)

@@ -42,11 +42,13 @@ def test_the_world_is_a_rate_limiter_and_a_torque_in_c_mujoco():
     assert 0.02 < arrived.mean() < 0.9, "some goals are reached, and on the way they are not"
 
 
+@pytest.mark.night  # MJX compiles for seconds
 def test_in_the_middle_of_a_recording_setpoints_begin_at_the_goals(pair):
     goals, *_, setpoints, _ = played(pair, VALUES, resumed=True)
     np.testing.assert_allclose(setpoints[0], goals[0], atol=1e-7)
 
 
+@pytest.mark.night  # MJX compiles for seconds
 def test_without_a_profile_setpoints_are_the_goals_at_once():
     robot = PairRobot(replace(SERVOS, sheet=replace(SHEET, profile_rad_s=float("inf"))))
     params = world_params(robot, VALUES, [0.0, 0.0], [0.0, 0.0], [0.1])
@@ -55,6 +57,7 @@ def test_without_a_profile_setpoints_are_the_goals_at_once():
     np.testing.assert_array_equal(setpoints, goals)
 
 
+@pytest.mark.night  # MJX compiles for seconds
 def test_friction_that_wears_off_lets_a_joint_move_faster():
     worn = PairRobot(replace(SERVOS, sheet=replace(SHEET, stribeck_rad_s=0.5)))
     fast = [

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from small_robot import SERVOS, SHEET, VALUES, PairRobot
 
-from sim2real.graph.episode import named_leaves
-from sim2real.robots.messages import Decision, EpisodeStart
+from sim2real.robots.messages import EpisodeStart
 from sim2real.robots.servo.servos import DataSheet
 
 
@@ -21,27 +20,6 @@ def slouching():
         observe=lambda reading, goal, aim: goal - reading.position,
         history=0,
     )
-
-
-def test_it_names_its_units_joints_and_actions(pair):
-    assert pair.units == {"position": "rad", "velocity": "rad/s", "goal": "rad", "aim[0]": "rad"}
-    assert pair.sensor.joints == {
-        "left": {"position": "position[0]", "velocity": "velocity[0]"},
-        "right": {"position": "position[1]", "velocity": "velocity[1]"},
-    }
-    assert [(a.name, a.unit) for a in pair.agent.action] == [
-        ("speed of left's goal", "rad/s"),
-        ("speed of right's goal", "rad/s"),
-    ]
-    assert [(t.name, t.size, t.history) for t in pair.agent.observation] == [
-        ("position", 2, 1),
-        ("velocity", 2, 1),
-        ("goal", 2, 1),
-        ("aim", 1, 1),
-        ("past position, velocity, goal", 6, 2),
-    ]
-    assert pair.drive.command in named_leaves(Decision(goal=np.zeros(2), aim=np.zeros(1)))
-    assert pair.model.tick_s == 0.01
 
 
 def test_a_data_sheets_gain_is_the_torque_of_a_step_of_error():

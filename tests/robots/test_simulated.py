@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_robot import VALUES, world_params
 
 from sim2real.artifacts.identification import Noise
 from sim2real.errors import UsageError
@@ -30,6 +31,16 @@ def test_the_world_is_half_a_step_behind_its_commands(pair):
     assert world.init_delays(None, gs) == {"actuator": pytest.approx(0.0225)}
     for params in ({}, {"actuator": DelayParams()}):
         assert world.init_delays(None, GraphState(params=params)) == {}
+
+
+def test_a_push_gives_the_joints_other_velocities_and_moves_nothing(pair):
+    world = pair.model.make_world()
+    params = world_params(pair, VALUES, [0.1, 0.2], [0.5, 0.0], [0.1])
+    state = world.init_state(jax.random.key(0), GraphState(params={"world": params}))
+    pushed = world.with_velocity(state, jnp.array([1.5, -1.0]))
+    np.testing.assert_array_equal(world.velocity(state), [0.5, 0.0])
+    np.testing.assert_array_equal(world.velocity(pushed), [1.5, -1.0])
+    np.testing.assert_array_equal(pushed.data.qpos, state.data.qpos)
 
 
 def test_the_sensor_passes_on_what_the_world_shows_with_its_own_delay(pair):

@@ -36,13 +36,7 @@ def compiled():
     return get
 
 
-FEW = (
-    topologies.loop,
-    topologies.robot,
-    topologies.unequal_rates,
-    topologies.policy_with_hiccups,
-    topologies.two_worlds,
-)
+FEW = (topologies.loop, topologies.unequal_rates, topologies.policy_with_hiccups)
 """Of the gate: a loop, rates that do not divide, several steps in a row. Each program compiles for seconds."""
 
 
@@ -87,7 +81,7 @@ GYM = [topologies.robot, topologies.unequal_rates, topologies.policy_with_hiccup
        topologies.slow_supervisor]  # fmt: skip
 
 
-@pytest.mark.parametrize("topology", some_at_night(GYM, topologies.robot, topologies.slow_supervisor))
+@pytest.mark.parametrize("topology", some_at_night(GYM, topologies.slow_supervisor))
 def test_steps_show_what_the_supervisor_would_have_seen(topology, compiled):
     graph = compiled(topology)
     supervisor = graph.supervisor

@@ -3,6 +3,7 @@
 import gc
 import sys
 import threading
+from unittest.mock import Mock
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +16,7 @@ from virtual_clock import VirtualClock
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph import Jitter, Scheduling
 from sim2real.graph.episode import MemoryRecorder
+from sim2real.runtime import clock as runtime_clock
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import MonotonicClock, realtime
 
@@ -238,8 +240,18 @@ def test_a_step_that_forgets_its_output_is_refused_before_anything_moves():
     assert node.calls == []
 
 
+def test_objects_of_a_caller_that_froze_none_are_frozen_for_the_block_alone(monkeypatch):
+    own = Mock(wraps=gc, get_freeze_count=lambda: 0, unfreeze=Mock())  # a real one would let the suite's objects go
+    monkeypatch.setattr(runtime_clock, "gc", own)
+    with realtime():
+        own.freeze.assert_called_once()
+        own.unfreeze.assert_not_called()
+    own.unfreeze.assert_called_once()
+
+
 def test_episodes_leave_the_interpreter_as_it_was(clock):
-    gc.unfreeze()
+    """What the caller has frozen, as the suite has, stays frozen."""
+    gc.freeze()
     before = sys.getswitchinterval()
     with realtime(), realtime():
         assert not gc.isenabled()
@@ -255,8 +267,4 @@ def test_episodes_leave_the_interpreter_as_it_was(clock):
         assert gc.collect() < 100, "steps leave cyclic garbage"
     assert gc.isenabled()
     assert sys.getswitchinterval() == before
-    assert gc.get_freeze_count() == 0
-    gc.freeze()
-    with realtime():
-        pass
-    assert gc.get_freeze_count() > 0  # the caller's own stay frozen
+    assert gc.get_freeze_count() > 0

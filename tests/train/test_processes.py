@@ -169,32 +169,6 @@ def test_each_process_says_who_can_join_and_where_the_coordinator_is_not_reached
     assert "warning" not in str(replace(own, coordinator="first:52700", process=1))
 
 
-@pytest.mark.night
-@pytest.mark.parametrize("launcher", [pytest.param("slurm", marks=pytest.mark.night), "open_mpi"])
-def test_processes_of_a_launcher_find_each_other(launcher):
-    text = "import os, signal; signal.signal(signal.SIGTERM, lambda *_: print('ended', flush=True)); "
-    text += "from sim2real.training.scale.processes import *; join(HostsConfig(found=True, timeout_s=20)); "
-    text += "os.kill(os.getpid(), signal.SIGTERM); print(jax.process_index(), jax.process_count(), leads())"
-    with socket.socket() as free:  # both launchers' processes derive their port from the job's number
-        free.bind(("127.0.0.1", 0))
-        job = free.getsockname()[1] % 2**12 + 2**12
-
-    def told(i):
-        if launcher == "slurm":
-            own = {"JOB_ID": job, "STEP_NODELIST": "localhost", "NTASKS": 2, "PROCID": i, "LOCALID": i}
-            return {f"SLURM_{name}": str(value) for name, value in own.items()}
-        own = {"SIZE": 2, "RANK": i, "LOCAL_RANK": i}
-        world = {f"OMPI_COMM_WORLD_{name}": str(value) for name, value in own.items()}
-        return {"OMPI_MCA_orte_hnp_uri": f"{job * 2**12}.0;tcp://127.0.0.1:34911", **world}
-
-    both = [
-        subprocess.Popen([sys.executable, "-c", text], stdout=subprocess.PIPE, text=True, env={**os.environ, **told(i)})
-        for i in (0, 1)
-    ]
-    said = [process.communicate(timeout=120)[0].split() for process in both]
-    assert said == [["ended", "0", "2", "True"], ["ended", "1", "2", "False"]], "a launcher ends both by SIGTERM"
-
-
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
