@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import sys
 import tempfile
 import time
@@ -30,10 +31,13 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from benches.hidden import arms, randomise
+from benches.hidden import arms, legs, randomise
 from benches.hidden import robots as pendulums
 from benches.jobs import Work, each
 from benches.rows import Report, Row, four_digits, markdown, row, share, values
+from benches.walk import EVERY_S
+from benches.walking.delays import WIDE_MS
+from benches.walking.train import require_gpu, train
 
 NOMINAL, IDENTIFIED = ("data_sheet", "wide"), ("point", "posterior")
 WAYS = {
@@ -71,6 +75,7 @@ class Case:
         seconds: Length of a deployment [s].
         record_s: Length of the recording [s].
         steps: Policy steps of a training.
+        ppo: Settings of PPO that differ from the robot's, of all ways.
     """
 
     tasks: tuple[str, ...]
@@ -79,20 +84,27 @@ class Case:
     seconds: float
     record_s: float
     steps: int
+    ppo: Mapping[str, float]
 
 
+# Goals move up to three times as fast as in reaching: with the usual exploration the tip never comes within 1 cm.
+CALMER = {"learning_rate": 1.5e-3, "log_std_init": -1.5}
 CASES = {
-    "pendulum": Case(("swing_up",), 1, 10, 8.0, 40.0, 3_000_000),
-    "arm": Case(("follow", "fast"), 4, 3, 4.0, 40.0, 1_500_000),
-    "so101": Case(("follow", "fast"), 4, 3, 4.0, 40.0, 2_000_000),
+    "pendulum": Case(("swing_up",), 1, 10, 8.0, 40.0, 3_000_000, {}),
+    "arm": Case(("follow", "fast"), 4, 3, 4.0, 40.0, 1_500_000, CALMER),
+    "so101": Case(("follow", "fast"), 4, 3, 4.0, 40.0, 2_000_000, CALMER),
+    "go2": Case(("walk",), 4, 1, 20.0, 12.0, 60_000_000, {}),
 }
+PUSH_M_S = 0.5
+"""Push of a Go2 every 5 s [m/s]; its commanded velocity changes every 2.5 s."""
 FIGURES = {
     "swing_up": (),
     "follow": (("error_m", 1e3, "error_mm", "mm"),),
     "fast": (("settled_s", 1.0, "settled_s", "s"), ("overshoot_m", 1e3, "overshoot_mm", "mm")),
+    "walk": (("error_m_s", 1.0, "error_m_s", "m/s"), ("error_rad_s", 1.0, "error_rad_s", "rad/s")),
 }
 """Task -> figures of a deployment beside success and energy: key, factor, name of the row, unit."""
-GOALS = {"follow": ("error_m", "<= 0.75"), "fast": ("settled_s", "<= 0.8")}
+GOALS = {"follow": ("error_m", "<= 0.75"), "fast": ("settled_s", "<= 0.8"), "walk": ("error_m_s", "<= 0.8")}
 """Task -> the figure of ``posterior`` over the better one of ``data_sheet`` and ``wide``, and its goal."""
 _ONE = dict.fromkeys(("units", "days", "trials"), 1)
 QUICK = {"robots": ["pendulum"], "tasks": ["swing_up"], "ways": ["data_sheet"], "steps": 512, "envs": 16, **_ONE}
@@ -109,6 +121,8 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--trials", type=int, help="deployments a day; default: 3, of a pendulum 10")
     parser.add_argument("--steps", type=int, help="policy steps of each training; default: the robot's own")
     parser.add_argument("--envs", type=int, default=256, help="copies of a training")
+    usual = "--ppo.num-envs=8192 --ppo.rollout-steps=12 --ppo.minibatches=8 --ppo.evaluations=1"
+    parser.add_argument("--flags", default=usual, help="flags of `sim2real train go2`, in one word")
     parser.add_argument("--work", type=Path, help="folder of the results; what is in it is used again")
     parser.add_argument("--minutes", type=float, default=1e6, help="time after which nothing new is begun")
     parser.add_argument("--jobs", type=int, default=1, help="trainings at once, one processor each")
@@ -130,8 +144,15 @@ def run(options: argparse.Namespace) -> Report:
         jobs = [job for job in jobs if not _file(options, *job).is_file()]
         needed = dict.fromkeys((name, unit) for name, _, way, unit in jobs if way in IDENTIFIED)
         missing = [unit for unit in needed if not (_model(options, *unit) / "parameters.json").is_file()]
-        for work, tasks in ((identify, missing), (train_and_judge, jobs)):
-            for i, done in each(partial(_tried, work), tasks, options):
+        # A Go2 trains on the GPU: one after the other.
+        alone = argparse.Namespace(**{**vars(options), "jobs": 1})
+        walking, others = ([job for job in jobs if (job[0] == "go2") is walks] for walks in (True, False))
+        for work, tasks, how in (
+            (identify, missing, options),
+            (train_and_judge, others, options),
+            (train_to_walk, walking, alone),
+        ):
+            for i, done in each(partial(_tried, work), tasks, how):
                 print(*tasks[i], done.get("failed", done.get("about", "")), flush=True)
         results = [json.loads(file.read_text()) for file in sorted(options.folder.glob("*.json"))]
         models = [json.loads(file.read_text()) for file in sorted(options.folder.glob("*/about.json"))]
@@ -172,6 +193,9 @@ def identify(name: str, unit: int, options: argparse.Namespace) -> dict[str, Any
     if name == "pendulum":
         excited = pendulums.excited(case.record_s, unit)
         pendulums.write(log, pendulums.play(_pendulum(unit), excited, case.record_s, 0))
+    elif name == "go2":
+        hidden = _twin(unit, 0)
+        legs.record(log, unit, case.record_s, (hidden.sensing_s, hidden.acting_s, 5e-4))
     else:
         arms.record(log, arms.HiddenArm.draw(name, unit, 0), robot, case.record_s)
     config = replace(robot.defaults.identify, folds=0, seed=unit)
@@ -197,6 +221,9 @@ def _hidden(name: str, unit: int) -> dict[str, Any]:
     if name == "pendulum":
         robot = _pendulum(unit)
         return {"round_trip_s": four_digits(robot.sensing + robot.acting)}
+    if name == "go2":
+        twin = _twin(unit, 0)
+        return {"round_trip_s": four_digits(twin.sensing_s + twin.acting_s)}
     arm = arms.HiddenArm.draw(name, unit, 0)
     plant = {n: np.round(v, 4).tolist() for n, v in arm.plant.items()}
     return {"round_trip_s": four_digits(arm.sensing + arm.acting), **plant}
@@ -207,6 +234,8 @@ def wide_ranges(name: str) -> dict[str, tuple[float, float]]:
     from sim2real.stages.load import load_robot
 
     robot: Any = load_robot(name)
+    if name == "go2":
+        return {**robot.defaults.train.vary.range, **{n: (low / 1e3, high / 1e3) for n, (low, high) in WIDE_MS.items()}}
     factors = {n: f for n in robot.nominal() for start, f in FACTORS[name].items() if n.startswith(start)}
     ranges = {n: tuple(four_digits(robot.nominal()[n] * f) for f in ends) for n, ends in factors.items()}
     return {**ranges, **DELAYS, **({} if name == "pendulum" else LOAD)}
@@ -223,7 +252,7 @@ def train_config(robot: Any, way: str, seed: int, options: argparse.Namespace) -
         "posterior": {"range": load},
     }[way]
     few = {"minibatches": 2, "evaluations": 1} if options.envs < usual.ppo.minibatches else {}
-    steps = options.steps or CASES[robot.name].steps
+    case = CASES[robot.name]
     return replace(
         usual,
         model="nominal" if way in NOMINAL else "identified",
@@ -232,7 +261,7 @@ def train_config(robot: Any, way: str, seed: int, options: argparse.Namespace) -
         force=True,
         sensitivity=False,
         vary=replace(usual.vary, **vary),
-        ppo=replace(usual.ppo, total_steps=steps, num_envs=options.envs, **few),
+        ppo=replace(usual.ppo, total_steps=options.steps or case.steps, num_envs=options.envs, **{**case.ppo, **few}),
     )
 
 
@@ -252,17 +281,82 @@ def train_and_judge(name: str, task: str, way: str, unit: int, options: argparse
     bundle = sim2real.train(robot, model, train_config(robot, way, unit, options))
     train_s = time.perf_counter() - begin
     trials = _judged(name, task, robot, bundle, unit, options)
-    history = bundle.history
+    in_simulation = np.round(np.asarray(bundle.history.success).max(axis=1), 3).tolist() if bundle.history else []
+    return _kept((name, task, way, unit), train_s, trials, options, in_simulation=in_simulation)
+
+
+def train_to_walk(name: str, task: str, way: str, unit: int, options: argparse.Namespace) -> dict[str, Any]:
+    """Train a Go2 by its command, judge the policy on the unit's days, and write the results into the folder."""
+    from sim2real.stages.load import load_robot
+
+    require_gpu("pays")
+    robot: Any = load_robot(name)
+    model = _model(options, name, unit) / "parameters.json"
+    named = ["--model", "identified", "--parameters", str(model), "--force"]
+    ranges = wide_ranges(name) if way == "wide" else {}
+    if way == "data_sheet":  # load and floor are the task's
+        usual = {n: v for n, v in robot.nominal().items() if n in wide_ranges(name)} | dict.fromkeys(WIDE_MS, 0.0)
+        ranges = {n: (v, v + 1e-6) for n, v in usual.items() if n not in ("payload", "foot_friction")}
+    flags = [*shlex.split(options.flags), "--seed", str(unit), *(named if way in IDENTIFIED else ())]
+    flags += ["--randomise", "0", "--vary.no-pauses"] if way == "point" else []
+    flags += [word for n, (low, high) in ranges.items() for word in ("--vary.range", n, f"{low:.7f}", f"{high:.7f}")]
+    begin = time.perf_counter()
+    with tempfile.TemporaryDirectory() as runs:
+        done = train(options.steps or CASES[name].steps, flags, Path(runs), {})
+        train_s = time.perf_counter() - begin
+        trials = [
+            {"day": day, "trial": 0, **_walked(robot, done.folder / "bundle", unit, day)}
+            for day in range(options.days or CASES[name].days)
+        ]
+    return _kept((name, task, way, unit), train_s, trials, options, flags=flags)
+
+
+def _twin(unit: int, day: int) -> Any:
+    """Return the hidden parameters of a Go2, 12 to 42 ms late, and of a day: load and floor."""
+    from sim2real.robots.walking.body import HiddenTwin
+
+    rng, today = np.random.default_rng([20261129, unit]), np.random.default_rng([20261129, unit, 1 + day])
+    total_s = rng.uniform(0.012, 0.042)
+    return replace(
+        HiddenTwin.draw(np.random.default_rng([unit, 2]), 12),  # as the emulator draws the robot of a number
+        sensing_s=total_s / 3,
+        acting_s=total_s / 1.5,
+        load_kg=today.uniform(-1.0, 2.5),
+        friction=today.uniform(0.4, 1.3),
+    )
+
+
+def _walked(robot: Any, bundle: Path, unit: int, day: int) -> dict[str, float]:
+    """Return the figures of a walk with velocity steps and pushes."""
+    from sim2real.policy.bundle import load_bundle
+    from sim2real.robots.walking.twin import Twin, walk
+
+    rng, seconds, most = np.random.default_rng([unit, day]), CASES["go2"].seconds, robot.commands.most
+    commands = rng.uniform(-1.0, 1.0, (int(seconds / EVERY_S) + 1, 3)) * most
+    twin = Twin(robot, _twin(unit, day), 100 * unit + day)
+    walked = walk(
+        twin, load_bundle(bundle), lambda t_s: commands[int(t_s / EVERY_S + 1e-6)], seconds, push_m_s=PUSH_M_S
+    )
+    lasted_s = seconds if walked.fell_s is None else walked.fell_s
+    return {
+        "success": float(walked.fell_s is None),
+        "error_m_s": walked.error_m_s,
+        "error_rad_s": walked.error_rad_s,
+        "energy_j": twin.energy_j * seconds / max(lasted_s, 0.1),
+    }
+
+
+def _kept(
+    job: tuple[Any, ...], train_s: float, trials: list[dict[str, float]], options: argparse.Namespace, **more: Any
+) -> dict[str, Any]:
+    """Write the results of a training into the folder, and return them in words."""
     result = {
-        "robot": name,
-        "task": task,
-        "way": way,
-        "unit": unit,
+        **dict(zip(("robot", "task", "way", "unit"), job, strict=True)),
         "train_s": round(train_s, 1),
-        "in_simulation": np.round(np.asarray(history.success).max(axis=1), 3).tolist() if history else [],
+        **more,
         "trials": [{n: four_digits(v) for n, v in trial.items()} for trial in trials],
     }
-    file = _file(options, name, task, way, unit)
+    file = _file(options, *job)
     partly = file.with_suffix(".part")
     partly.write_text(json.dumps(result))
     partly.rename(file)
@@ -347,6 +441,7 @@ TASKS = {
     ("arm", "fast"): ("arm, time to stay within 1 cm", "settled_s", 1.0, "s"),
     ("so101", "follow"): ("SO-101, figure of eight: error", "error_mm", 1.0, "mm"),
     ("so101", "fast"): ("SO-101, time to stay within 1 cm", "settled_s", 1.0, "s"),
+    ("go2", "walk"): ("Go2, velocity steps with pushes: error", "error_m_s", 1.0, "m/s"),
 }
 """Robot and task -> what a table and a figure show: label, row, factor, unit."""
 

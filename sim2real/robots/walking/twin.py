@@ -57,6 +57,7 @@ class Twin:
 
     Attributes:
         sent: Targets ``(joints,)`` that were sent last [rad].
+        energy_j: Integral of the power of all motors, without its sign, since the start [J].
     """
 
     def __init__(
@@ -69,7 +70,7 @@ class Twin:
         how: dict[str, Any] = {"step_s": STEP_S, "settle_s": 0.0, "ground": self._rough}
         height_m = robot.height_m + bumps_m
         self.body = LeggedBody(robot.mjcf, robot.feet, robot.stance, height_m, self.hidden, **how)
-        self.model, self.data = self.body.model, self.body.data
+        self.model, self.data, self.energy_j = self.body.model, self.body.data, 0.0
         self._drive(np.asarray(robot.stance))
         late = round(self.hidden.sensing_s / STEP_S)
         self._past = deque([self._measured()] * (late + 1), maxlen=late + 1)
@@ -92,6 +93,7 @@ class Twin:
             while self._coming and self._coming[0][0] <= self.data.time + 1e-9:
                 self._drive(self._coming.popleft()[1])
             self.body.step()
+            self.energy_j += STEP_S * float(np.abs(self.data.actuator_force * self.data.qvel[6:]).sum())
             self._past.append(self._measured())
 
     def push(self, size_m_s: float) -> None:
