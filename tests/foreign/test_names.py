@@ -108,7 +108,7 @@ def test_true_answers_make_a_drawn_log_right(tmp_path, seed):
         found = proposed(path)
     except UsageError:
         return
-    text = found.toml("log.csv")
+    text = found.toml()
     units = {"counts": "counts:4096"}
     for node, unit in (("sensor", log.units[0]), ("actuator", log.units[1])):
         head, mark, tail = text.partition(f"[nodes.{node}.fields.")

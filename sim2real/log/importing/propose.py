@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -69,39 +69,6 @@ class ImportHints:
     calibration: Path | None = None
 
 
-@dataclass
-class Proposal:
-    """A mapping, with the evidence for each line, and what is open.
-
-    Attributes:
-        joints: Names of the columns of measured positions, in the order of the log; numbers without names.
-        reasons: Evidence for a line of the mapping.
-        questions: What names and data do not decide: the line with its candidates.
-        evidence: Further sentences.
-    """
-
-    mapping: ImportMapping
-    joints: tuple[str, ...] = ()
-    reasons: dict[Key, str] = field(default_factory=dict)
-    questions: dict[Key, str] = field(default_factory=dict)
-    evidence: list[str] = field(default_factory=list)
-
-    def toml(self, name: str) -> str:
-        """Return the text of the mapping file of a file of this name."""
-        head = [f"Proposed by `sim2real import {name}`.", *self.evidence, f"Joints: {', '.join(self.joints)}"]
-        if self.questions:
-            ask = "Put an answer in place of each line with a question mark, then give this file to --mapping."
-            head.insert(1, ask)
-        return to_toml(self.mapping, head, self.reasons, self.questions)
-
-    def open_questions(self) -> list[str]:
-        """Return the open questions, one sentence each."""
-        return [
-            f"nodes.{node}.{f'fields.{name}.' * bool(name)}{key} = {text}"
-            for (node, name, key), text in self.questions.items()
-        ]
-
-
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # damaged files can hold numbers of any size
 def propose(table: Table, hints: ImportHints) -> Proposal:
     """Return the mapping that names and units give, checked against the data.
@@ -109,26 +76,54 @@ def propose(table: Table, hints: ImportHints) -> Proposal:
     Raises:
         UsageError: When names do not match those of the robot, or the data contradict the names.
     """
-    return _Proposer(table, hints).proposed()
+    proposal = Proposal(table, hints)
+    proposal.complete()
+    return proposal
 
 
-class _Proposer:
-    """Makes a proposal: collects reasons, questions and evidence on the way."""
+class Proposal:
+    """A mapping, with the evidence for each line, and what is open.
+
+    Attributes:
+        mapping: The mapping; where a question is open, it holds the likeliest answer.
+        joints: Names of the columns of measured positions, in the order of the log; numbers without names.
+        reasons: Evidence for a line of the mapping.
+        questions: What names and data do not decide: the line with its candidates.
+        evidence: Further sentences.
+    """
 
     def __init__(self, table: Table, hints: ImportHints) -> None:
         self.table, self.hints = table, hints
         self.signals, notes = collect(table)
+        self.mapping = ImportMapping(hints.pipeline, {})
+        self.joints: tuple[str, ...] = ()
         self.reasons: dict[Key, str] = {}
         self.questions: dict[Key, str] = {}
         self.evidence = [*table.notes, *notes]
 
-    def proposed(self) -> Proposal:
+    def toml(self) -> str:
+        """Return the text of the mapping file."""
+        head = [f"Proposed by `sim2real import {self.table.path.name}`."]
+        if self.questions:
+            head.append("Put an answer in place of each line with a question mark, then give this file to --mapping.")
+        head += [*self.evidence, f"Joints: {', '.join(self.joints)}"]
+        return to_toml(self.mapping, head, self.reasons, self.questions)
+
+    def open_questions(self) -> str:
+        """Return the open questions, one sentence each."""
+        return "; ".join(
+            f"nodes.{node}.{f'fields.{name}.' * bool(name)}{key} = {text}"
+            for (node, name, key), text in self.questions.items()
+        )
+
+    def complete(self) -> None:
+        """Propose the mapping, and check it."""
         # Which columns are the positions and the commands, and of which joints.
         measured = self.choose("measured", self.signals)
         command = self.choose("command", [s for s in self.signals if s is not measured], measured)
-        places, joints = self.joint_order(measured)
+        places, self.joints = self.joint_order(measured)
         measured = measured.taken(places)
-        command, by_name = self.matched(command, measured, places, joints)
+        command, by_name = self.matched(command, measured, places)
         # Their clocks, units, and what goes along.
         sides = {"actuator": command, "sensor": measured}
         clocks = {node: self.clock(signal, node) for node, signal in sides.items()}
@@ -149,11 +144,10 @@ class _Proposer:
         self.add_extras(command, measured, places, fields)
         self.add_velocities(command, measured, places, fields, clocks)
         nodes = {node: NodeMapping(self.in_lengths(fields[node]), **clocks[node][0]) for node in sides}
-        mapping = ImportMapping(self.hints.pipeline, nodes)
+        self.mapping = ImportMapping(self.hints.pipeline, nodes)
         self.evidence += about_torque({n: msgspec.to_builtins(node) for n, node in nodes.items()})
-        self.add_unused(mapping)
-        mapping = self.checked(mapping, joints, by_name, inferred)
-        return Proposal(mapping, joints, self.reasons, self.questions, self.evidence)
+        self.add_unused()
+        self.check(by_name, inferred)
 
     # -- positions, commands, and their joints
 
@@ -223,15 +217,13 @@ class _Proposer:
         )
         return list(range(measured.width)), joints
 
-    def matched(
-        self, command: Signal, measured: Signal, places: Sequence[int], robot: Sequence[str]
-    ) -> tuple[Signal, bool]:
+    def matched(self, command: Signal, measured: Signal, places: Sequence[int]) -> tuple[Signal, bool]:
         """Return the commands in the order of the joints, and whether names match them."""
         if all(measured.labels) and set(measured.labels) <= set(command.labels):
             return command.taken([command.labels.index(label) for label in measured.labels]), True
         if ("actuator", "goal", "source") in self.questions:
             return command, True
-        for joints in (measured.labels, robot):
+        for joints in (measured.labels, self.joints):
             if all(joints) and any(command.labels) and (found := columns_of(joints, command.labels)) is not None:
                 if found[1] != "by name":
                     self.evidence.append(f"commands belong to positions {found[1]}")
@@ -451,9 +443,11 @@ class _Proposer:
             else:
                 self.evidence.append(f"{s.name!r} is not the rate of {of.name!r}: omitted")
 
-    def add_unused(self, mapping: ImportMapping) -> None:
+    def add_unused(self) -> None:
         """Add a note on signals of motion or commands that are not imported."""
-        used = {source for node in mapping.nodes.values() for how in node.fields.values() for source in how.sources}
+        used = {
+            source for node in self.mapping.nodes.values() for how in node.fields.values() for source in how.sources
+        }
         left = [
             s.name for s in self.signals
             if s.meaning.quantity in ("", "position", "velocity", "torque", "duty", "voltage")
@@ -465,46 +459,37 @@ class _Proposer:
 
     # -- what the data say
 
-    def checked(
-        self, mapping: ImportMapping, joints: Sequence[str], by_name: bool, inferred: Sequence[tuple[str, str]]
-    ) -> ImportMapping:
-        """Return the mapping with the policies that the data need; refuse or ask what the data contradict."""
-        drops = {"missing": "drop", "implausible": "drop"}
-        all_dropped = {
-            name: msgspec.structs.replace(node, **drops, **({"repeated": "first"} if node.stamps else {}))
-            for name, node in mapping.nodes.items()
+    def check(self, by_name: bool, inferred: Sequence[tuple[str, str]]) -> None:
+        """Give the mapping the policies that the data need; refuse or ask what the data contradict."""
+        goal = self.mapping.nodes["actuator"].fields.get("goal")
+        drops = {
+            name: {"missing": "drop", "implausible": "drop"} | ({"repeated": "first"} if node.stamps else {})
+            for name, node in self.mapping.nodes.items()
         }
-        goal = mapping.nodes["actuator"].fields.get("goal")
         try:
-            episode = import_table(self.table, msgspec.structs.replace(mapping, nodes=all_dropped))
+            episode = import_table(self.table, self.with_policies(drops))
         except UsageError as error:
             if inferred and goal is not None and not self.questions:
                 text = str(error).partition("\n")[0]
                 self.questions[(*inferred[0], "unit")] = f'"{goal.unit}" or another?  # {text}; --unit answers, too'
             elif not self.questions:
                 raise
-            return mapping
+            return
         # Keep the policies that drop something.
-        words = {
-            "missing": "samples lack a number",
-            "repeated": "stamps repeat",
-            "implausible": "samples leap away and back",
-        }
-        nodes = {}
-        for name, node in mapping.nodes.items():
-            dropped = {policy: n for policy, n in episode.metadata["source"]["dropped"][name].items() if n}
-            nodes[name] = msgspec.structs.replace(node, **{p: getattr(all_dropped[name], p) for p in dropped})
-            self.reasons |= {(name, "", policy): f"{n} {words[policy]}" for policy, n in dropped.items()}
+        dropped = episode.metadata["source"]["dropped"]
+        self.mapping = self.with_policies({n: {p: drops[n][p] for p in counts} for n, counts in dropped.items()})
+        why = {"missing": "lack a number", "repeated": "repeat a stamp", "implausible": "leap away and back"}
+        for node, counts in dropped.items():
+            self.reasons |= {(node, "", policy): f"{n} samples {why[policy]}" for policy, n in counts.items()}
         if not self.questions:
-            self.weigh(checks.check_episode(episode, joints, by_name), goal, joints, inferred)
-        return msgspec.structs.replace(mapping, nodes=nodes)
+            self.weigh(checks.check_episode(episode, self.joints, by_name), goal, inferred)
+
+    def with_policies(self, policies: Mapping[str, Mapping[str, str]]) -> ImportMapping:
+        nodes = {n: msgspec.structs.replace(node, **policies[n]) for n, node in self.mapping.nodes.items()}
+        return msgspec.structs.replace(self.mapping, nodes=nodes)
 
     def weigh(
-        self,
-        findings: Sequence[checks.Finding],
-        goal: FieldMapping | None,
-        joints: Sequence[str],
-        inferred: Sequence[tuple[str, str]],
+        self, findings: Sequence[checks.Finding], goal: FieldMapping | None, inferred: Sequence[tuple[str, str]]
     ) -> None:
         """Refuse what contradicts the mapping, and ask what fits several mappings."""
         self.evidence += [f.text for f in findings if f.weight == "note"]
@@ -515,37 +500,29 @@ class _Proposer:
             return
         followed = any(f.kind == "follows" and f.weight == "note" for f in findings)
         # A joint of another scale than the others is refused by its name; if all are, their unit is open.
-        answers = {"sign": "scale", "order": "source", "slope": "unit", "follows": "unit"}
+        keys = {"sign": "scale", "order": "source", "slope": "unit", "follows": "unit"}
         wrong = [
-            f for f in open_ones if f.kind not in answers or (f.kind == "slope" and f.weight == "refuse" and followed)
+            f for f in open_ones if f.kind not in keys or (f.kind == "slope" and f.weight == "refuse" and followed)
         ]
         if wrong:
             text = "; ".join(f.text for f in wrong)
             raise UsageError(f"{self.table.path}: {text}", hint=checks.hint_for(wrong))
         if goal is None:
             return
-        for f in open_ones:
-            node, name = inferred[0] if inferred and answers[f.kind] == "unit" else ("actuator", "goal")
-            at = node, name, answers[f.kind]
-            candidates = f'"{goal.unit}" or another?'
-            if f.kind == "sign":
-                scale = np.broadcast_to(goal.scale, (len(joints),)).tolist()
-                flipped = [
-                    -x if any((o.kind, o.joint) == ("sign", i) for o in open_ones) else x for i, x in enumerate(scale)
-                ]
-                candidates = f"{flipped} or {scale}?"
-            elif f.kind == "order":
-                candidates = f"{json.dumps(goal.sources)} in another order?"
-            self.questions[at] = (
-                f"{self.questions[at]}; {f.text}"
-                if at in self.questions
-                else f"{candidates}  # --as-told keeps the file's: {f.text}"
-            )
-        for node, name in inferred if not followed else ():
-            self.questions.setdefault(
-                (node, name, "unit"),
-                f'"{goal.unit}" or another?  # no joint moves, so nothing proves it; --unit answers, too',
-            )
+        scale = np.broadcast_to(goal.scale, (len(self.joints),)).tolist()
+        against = {f.joint for f in open_ones if f.kind == "sign"}
+        candidates = {
+            "scale": f"{[-x if i in against else x for i, x in enumerate(scale)]} or {scale}?",
+            "source": f"{json.dumps(goal.sources)} in another order?",
+            "unit": f'"{goal.unit}" or another?',
+        }
+        for key in dict.fromkeys(keys[f.kind] for f in open_ones):
+            node, name = inferred[0] if inferred and key == "unit" else ("actuator", "goal")
+            why = "; ".join(f.text for f in open_ones if keys[f.kind] == key)
+            self.questions[node, name, key] = f"{candidates[key]}  # {why}; --as-told keeps the file's"
+        for at in inferred if not followed else ():
+            text = f"{candidates['unit']}  # no joint moves, so nothing proves it; --unit answers, too"
+            self.questions.setdefault((*at, "unit"), text)
 
 
 def _rank(named: Meaning, side: str) -> int | None:
@@ -616,7 +593,7 @@ def joint_motion(table: Table, joints: Sequence[str], unit: str) -> tuple[np.nda
     Raises:
         UsageError: When no columns have these names, or their clock or unit is open.
     """
-    of = _Proposer(table, ImportHints("", joints=tuple(joints)))
+    of = Proposal(table, ImportHints("", joints=tuple(joints)))
     motions = []
     for s in of.signals:
         if s.values.ndim != 2 or s.meaning.quantity not in ("position", ""):

@@ -145,48 +145,29 @@ def proposed(table: Table, hints: ImportHints, out: Path | None = None) -> tuple
         for line in table.notes:  # a signal that the file's reader omitted may be the cause
             note(line)
         raise
+    text = proposal.toml()
     note(f"proposed mapping for {table.path.name}:")
-    for line in [*reasons_of(proposal), *proposal.evidence]:
-        note(f"  {line}")
-    text = proposal.toml(table.path.name)
+    for line in text.splitlines():
+        note(f"  {line}".rstrip())
     if proposal.questions:
-        raise open_questions(proposal, table.path, text, out)
+        raise _open_questions(proposal, table.path, text, out)
     return proposal.mapping, text
 
 
-def reasons_of(proposal: Proposal) -> list[str]:
-    """Return the lines of a proposed mapping that have a reason, each with it."""
-    lines = []
-    for (node, name, key), reason in proposal.reasons.items():
-        owner = proposal.mapping.nodes[node]
-        how = owner.fields.get(name) if name else owner
-        if (
-            (node, name, key) not in proposal.questions
-            and how is not None
-            and (value := getattr(how, key, None)) is not None
-        ):
-            lines.append(f"{node}.{name + '.' if name else ''}{key} = {value}: {reason}")
-    return lines
-
-
-def open_questions(proposal: Proposal, path: Path, text: str, out: Path | None) -> UsageError:
+def _open_questions(proposal: Proposal, path: Path, text: str, out: Path | None) -> UsageError:
     """Write a proposed mapping with its open questions, and return the error that lists them."""
     file = out.with_suffix(".import.toml") if out is not None else Path(f"{path.stem}.import.toml")
-    lines = "; ".join(proposal.open_questions())
+    said = f"the names in {path} leave open: {proposal.open_questions()}"
     if file.is_file() and file.read_text(encoding="utf-8", errors="replace") != text:
-        hint = f"{file} exists with other content: answer there, or remove it"
-    else:
-        try:
-            file.write_text(text, encoding="utf-8")
-        except OSError as error:
-            return UsageError(
-                f"the names in {path} leave open: {lines}", hint=f"{file} cannot be written: {error.strerror}"
-            )
-        words = sys.argv[1:]
-        taking = words[:1] and words[0] in ("import", "identify", "check", "new")
-        command = shlex.join(["sim2real", *words]) if taking else f"sim2real import {path}"
-        hint = f"answer in {file}, then {command} --mapping {file}"
-    return UsageError(f"the names in {path} leave open: {lines}", hint=hint)
+        return UsageError(said, hint=f"{file} exists with other content: answer there, or remove it")
+    try:
+        file.write_text(text, encoding="utf-8")
+    except OSError as error:
+        return UsageError(said, hint=f"{file} cannot be written: {error.strerror}")
+    words = sys.argv[1:]
+    taking = words[:1] and words[0] in ("import", "identify", "check", "new")
+    command = shlex.join(["sim2real", *words]) if taking else f"sim2real import {path}"
+    return UsageError(said, hint=f"answer in {file}, then {command} --mapping {file}")
 
 
 def refuse_contradictions(path: Path, episode: Episode, as_told: bool, joints: Sequence[str] = ()) -> None:
