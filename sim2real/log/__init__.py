@@ -5,7 +5,6 @@ from sim2real.log.importing.mapping import ImportMapping as ImportMapping
 from sim2real.log.importing.mapping import load_mapping as load_mapping
 from sim2real.log.reader import LogTail as LogTail
 from sim2real.log.reader import TruncatedLogWarning as TruncatedLogWarning
-from sim2real.log.reader import read_attachment as read_attachment
 from sim2real.log.reader import read_log as read_log
 from sim2real.log.reader import read_session as read_session
 from sim2real.log.reader import summary as summary

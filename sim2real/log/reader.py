@@ -64,41 +64,26 @@ class TruncatedLogWarning(UserWarning):
 
 
 class _Record(NamedTuple):
-    """A record's opcode, and start and end of its content in the file."""
-
     opcode: int
-    start: int
+    start: int  # of its content in the file
     end: int
 
 
 @dataclass
 class _Contents:
-    """The content of a log file.
+    """The content of a log file."""
 
-    Attributes:
-        library: The library that wrote the file, according to its header.
-        session: The session's metadata; None if damaged.
-        end: The metadata written at the session's end; None after a crash.
-        attachments: File name -> content.
-        epoch_ns: Wall clock at the episode's time 0 [ns]; 0 if the episode never started.
-        channels: Channel number -> channel.
-        messages: Channel number -> message records, in the order of the file; empty if no chunk was opened.
-        indexed: Channel number -> number of messages, according to the chunks' indices.
-        last_log_time: Latest log time of all chunks [ns].
-        skipped: Descriptions of the unreadable places.
-    """
-
-    library: str = ""
-    session: dict[str, Json] | None = None
-    end: dict[str, Json] | None = None
+    library: str = ""  # that wrote the file, according to its header
+    session: dict[str, Json] | None = None  # the session's metadata; None if damaged
+    end: dict[str, Json] | None = None  # the metadata written at the session's end; None after a crash
     attachments: dict[str, bytes] = field(default_factory=dict)
-    epoch_ns: int = 0
+    epoch_ns: int = 0  # wall clock at the episode's time 0; 0 if the episode never started
     channels: dict[int, Channel] = field(default_factory=dict)
-    messages: dict[int, list[bytes]] = field(default_factory=dict)
-    indexed: dict[int, int] = field(default_factory=dict)
+    messages: dict[int, list[bytes]] = field(default_factory=dict)  # of each channel, in the order of the file
+    indexed: dict[int, int] = field(default_factory=dict)  # number of messages, according to the chunks' indices
     chunks: int = 0
-    last_log_time: int = 0
-    skipped: list[str] = field(default_factory=list)
+    last_log_time: int = 0  # of all chunks [ns]
+    skipped: list[str] = field(default_factory=list)  # descriptions of the unreadable places
 
     def skip(self, description: str) -> None:
         """Add the description of an unreadable place."""
@@ -287,18 +272,6 @@ def read_session(path: str | Path) -> dict[str, Json]:
     if session is None:
         raise Sim2RealError(f"the session metadata of {path} is damaged", hint="read_log still reads the data")
     return session
-
-
-def read_attachment(path: str | Path, name: str) -> bytes:
-    """Return the content of a file that was attached to a log.
-
-    Raises:
-        Sim2RealError: As ``read_log``, and when there is no such attachment.
-    """
-    attachments = _walk(path).attachments
-    if name not in attachments:
-        raise Sim2RealError(f"the log {path} has no attachment {name!r}. Available: {', '.join(attachments) or 'none'}")
-    return attachments[name]
 
 
 def summary(path: str | Path) -> dict[str, Json]:

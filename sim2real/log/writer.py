@@ -361,9 +361,8 @@ class McapRecorder:
         self.path = Path(path)
         self._names = {node: dict.fromkeys(named_leaves(example)) for node, example in outputs.items()}
         self._file = SessionFile(self.path, metadata, attachments, outputs, inputs, joint_states or {}, units)
-        # The queue between the control loops and the writer's thread: time of the put, method, arguments.
-        self._queue: queue.SimpleQueue[tuple[float, Callable[..., None], tuple[Any, ...]] | None]
-        self._queue = queue.SimpleQueue()
+        # The queue between the control loops and the writer's thread: method and arguments.
+        self._queue: queue.SimpleQueue[tuple[Callable[..., None], tuple[Any, ...]] | None] = queue.SimpleQueue()
         # Memory of the arrays in each node's outputs, and the steps of each node, which one thread counts.
         self._sizes = {
             node: sum(np.asarray(leaf).nbytes for leaf in named_leaves(example).values())
@@ -373,7 +372,6 @@ class McapRecorder:
         self._written = dict.fromkeys(outputs, 0)
         self._puts = self._done = 0
         self._max_bytes = _max_queue_bytes()
-        self._at_s: float | None = None  # when the record that is being written was queued
         self._error: BaseException | None = None
         self._failed: Sim2RealError | None = None
         self._started = self._closed = False
@@ -384,10 +382,9 @@ class McapRecorder:
         _open_logs.add(self)
 
     @property
-    def behind_s(self) -> float:
-        """Age of the record that is being written [s]; 0 if none is."""
-        at_s = self._at_s
-        return 0.0 if at_s is None else time.monotonic() - at_s
+    def waiting(self) -> int:
+        """Number of records that wait in memory for the disk."""
+        return self._queue.qsize()
 
     def start(self, epoch_ns: int, monotonic_ns: int) -> None:
         """Queue the episode's start.
@@ -481,11 +478,11 @@ class McapRecorder:
             raise Sim2RealError(f"the log {self.path} is closed")
         if self._failed is not None:
             raise self._failed
-        self._queue.put((time.monotonic(), write, arguments))
+        self._queue.put((write, arguments))
         self._puts += 1
         if self._puts % RECORDS_PER_CHECK == 0 and self._queue_bytes() > self._max_bytes:
             self._failed = Sim2RealError(
-                f"{self._queue.qsize():,} records wait in memory, as the disk is too slow: more than "
+                f"{self.waiting:,} records wait in memory, as the disk is too slow: more than "
                 f"{self._max_bytes / 1e6:.0f} MB for the log {self.path}",
                 hint="the log holds every record until now; record fewer or smaller outputs, at a lower rate, close "
                 "other programs on this machine, or write to a faster, local disk",
@@ -493,7 +490,7 @@ class McapRecorder:
 
     def _queue_bytes(self) -> int:
         arrays = sum(self._sizes[n] * max(0, self._queued[n] - self._written[n]) for n in self._sizes)
-        return RECORD_BYTES * self._queue.qsize() + arrays
+        return RECORD_BYTES * self.waiting + arrays
 
     def _wait(self, report: Callable[[str], None] | None) -> None:
         """Wait until the writer has written the queue, as long as it makes progress."""
@@ -503,7 +500,7 @@ class McapRecorder:
             if not self._thread.is_alive():
                 return
             silent_s = silent_s + WAIT_S if self._done == done else 0.0
-            done, left = self._done, self._queue.qsize()
+            done, left = self._done, self.waiting
             if silent_s > STUCK_S:
                 raise Sim2RealError(
                     f"the disk took no data for {STUCK_S:.0f} s: the log {self.path} has no end, "
@@ -511,7 +508,7 @@ class McapRecorder:
                     hint="the written part of the log can be read; write logs to a local disk",
                 )
             if report is not None and left and waits % REPORT_WAITS == 0:
-                report(f"writing the log: {left:,} records wait, the oldest for {self.behind_s:.0f} s")
+                report(f"writing the log: {left:,} records wait")
 
     def _failure(self) -> Sim2RealError:
         """Return the error that all later calls raise; it is one object, so that it is reported once."""
@@ -531,34 +528,22 @@ class McapRecorder:
                 with contextlib.suppress(queue.Empty):
                     item = self._queue.get(timeout=max(0.0, flush_at - time.monotonic()))
                     if item is None:
-                        self._at_s = None
                         return
-                    self._write(*item)
+                    write, arguments = item
+                    write(*arguments)
+                    self._done += 1
+                    if write == self._file.step:
+                        self._written[arguments[0].node] += 1
                 # Flush after each period, so that a crash costs little data; sync less often, as it takes longer.
-                if (now := time.monotonic()) < flush_at:
-                    continue
-                self._at_s = self._at_s or now
-                self._file.flush()
-                flush_at = now + FLUSH_PERIOD_S
-                if now >= sync_at:
-                    self._file.sync()
-                    sync_at = now + SYNC_PERIOD_S
-                self._rest()
+                if (now := time.monotonic()) >= flush_at:
+                    self._file.flush()
+                    flush_at = now + FLUSH_PERIOD_S
+                    if now >= sync_at:
+                        self._file.sync()
+                        sync_at = now + SYNC_PERIOD_S
+                    self._done += 1
         except BaseException as error:
             self._error = error
-
-    def _write(self, at_s: float, write: Callable[..., None], arguments: tuple[Any, ...]) -> None:
-        self._at_s = at_s
-        write(*arguments)
-        if write == self._file.step:
-            self._written[arguments[0].node] += 1
-        self._rest()
-
-    def _rest(self) -> None:
-        """Count a finished write; without further records the writer is not behind."""
-        self._done += 1
-        if self._queue.empty():
-            self._at_s = None
 
 
 _open_logs: set[McapRecorder] = set()

@@ -10,7 +10,7 @@ import pytest
 
 from sim2real.errors import SafetyStop, Sim2RealError, UsageError
 from sim2real.graph.episode import MemoryRecorder, StepRecord
-from sim2real.log import McapRecorder, TruncatedLogWarning, read_attachment, read_log, read_session, summary
+from sim2real.log import McapRecorder, TruncatedLogWarning, read_log, read_session, summary
 
 
 def assert_same(a, b):
@@ -75,10 +75,8 @@ def test_jax_arrays_and_reused_buffers_are_recorded_as_they_were(tmp_path):
 
 def test_metadata_reads_without_the_data(session_log):
     assert read_session(session_log)["pipeline"] == "fake"
-    assert read_attachment(session_log, "model.bin") == fake_sessions.ATTACHMENTS["model.bin"]
-    with pytest.raises(Sim2RealError, match=r"no attachment 'x'\. Available: config.yaml, model.bin"):
-        read_attachment(session_log, "x")
     facts = summary(session_log)
+    assert facts["attachments"] == {name: len(content) for name, content in fake_sessions.ATTACHMENTS.items()}
     assert facts["topics"]["/sensor/step"] == 800
     assert facts["topics"]["/joint_states"] == 800
     assert facts["topics"]["/agent/inputs/sensor_reading"] == 799

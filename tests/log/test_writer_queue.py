@@ -43,7 +43,7 @@ def test_close_waits_for_a_slow_disk_and_reports_it(held, monkeypatch):
     monkeypatch.setattr(writer, "REPORT_WAITS", 1)
     feed(recorder, 200)
     assert entered.wait(60)
-    assert recorder.behind_s > 0
+    assert recorder.waiting > 0
     reports = []
 
     def report(text):
@@ -53,7 +53,7 @@ def test_close_waits_for_a_slow_disk_and_reports_it(held, monkeypatch):
     recorder.close(report=report)
     assert "199 records" in reports[0] or "200 records" in reports[0]
     assert len(read_log(recorder.path).steps["n"]) == 200
-    assert recorder.behind_s == 0
+    assert recorder.waiting == 0
 
 
 def test_a_disk_that_takes_nothing_ends_the_wait(held, monkeypatch):

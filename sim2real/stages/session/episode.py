@@ -36,7 +36,7 @@ from sim2real.stages.terminal.interruption import interruptible
 LATE_SHARE = 0.01
 """Share of late steps above which ``--strict-timing`` ends with code 5, and of late answers above which it is said."""
 _POLL_S, _REST_POLL_S = 0.25, 0.02
-WARN_BEHIND_S = 1.0
+WARN_WAITING = 5_000
 """Age of the record that is being written above which a warning names the slow disk [s]."""
 _INTERRUPTED = 130
 
@@ -265,8 +265,8 @@ def _drive(
             graph.run_for(min(_POLL_S, left))
             bar.n = round(min(duration_s, 1e-9 * (clock.now_ns() - begin_ns)), 1)
             bar.refresh()
-            if recorder.behind_s > WARN_BEHIND_S and not warned:
-                note(f"warning: the disk is slow: the log is {recorder.behind_s:.0f} s behind, kept in memory")
+            if recorder.waiting > WARN_WAITING and not warned:
+                note(f"warning: the disk is slow: {recorder.waiting:,} records of the log wait in memory")
                 warned = True
 
 
