@@ -34,227 +34,134 @@ Case = dict[str, Any]
 """One picture, in milliseconds: ``title``, ``lanes`` and ``messages`` (see ``case``), and ``notes``."""
 
 
-def case(title: str, nodes: Sequence[BaseNode], timeline: Timeline, names: Mapping[str, str] | None = None) -> Case:
-    """Return a picture of the first episode of a timeline, one lane for each node."""
+def case(
+    title: str,
+    nodes: Sequence[BaseNode],
+    busy: Sequence[Sequence[float]],
+    travel: Mapping[tuple[str, str], Sequence[float]] | None = None,
+    hidden: Sequence[BaseNode] = (),
+) -> tuple[Case, Timeline]:
+    """Return the picture of a timeline, one lane for each node, and the timeline.
+
+    Args:
+        busy: Duration of the steps of each node, then of each hidden one [ms].
+        travel: (reader, sender) -> delay of each message [ms]; without them, no message is drawn.
+        hidden: Nodes without a lane.
+    """
+    every = [*nodes, *hidden]
+    ticks = lambda values: np.array([[to_ticks(v / 1000) for v in values]])  # noqa: E731
+    durations = {node.name: ticks(times) for node, times in zip(every, busy, strict=True)}
+    delays = {key: ticks(times) for key, times in (travel or {}).items()}
+    timeline = derive({n.name: n for n in every}, durations, delays, int(NEVER))
     lanes, messages = [], []
     for node in nodes:
-        v = timeline.vertices[node.name]
-        count = int(v.count[0])
-        lanes.append(
-            {
-                "node": (names or {}).get(node.name, node.name),
-                "slots": _ms(slot(node, np.arange(count))),
-                "start": _ms(v.start[0, :count]),
-                "end": _ms(v.end[0, :count]),
-            }
-        )
+        v, count = timeline.vertices[node.name], len(busy[every.index(node)])
+        lane = {"node": node.name, "slots": _ms(slot(node, np.arange(count)))}
+        lanes.append(lane | {"start": _ms(v.start[0, :count]), "end": _ms(v.end[0, :count])})
     place = {n.name: i for i, n in enumerate(nodes)}
     for (reader, name), edge in timeline.edges.items():
+        if not {reader, edge.sender} <= place.keys():
+            continue
         begin, sent = timeline.vertices[reader].start[0], timeline.vertices[edge.sender].end[0]
         for m, k in enumerate(edge.seq_in[0].tolist()):
-            if edge.received[0, m] >= NEVER:
-                continue
-            messages.append(
-                {
-                    "seq": m,
-                    "from": place[edge.sender],
-                    "to": place[reader],
-                    "input": name,
-                    "sent": _ms(sent[m]),
-                    "received": _ms(edge.received[0, m]),
-                    "read": _ms(begin[k]) if k >= 0 else None,
-                }
-            )
-    return {"title": title, "lanes": lanes, "messages": messages, "notes": []}
+            if edge.received[0, m] < NEVER:
+                ends = {"from": place[edge.sender], "to": place[reader], "input": name}
+                times = {"sent": _ms(sent[m]), "received": _ms(edge.received[0, m])}
+                messages.append({"seq": m} | ends | times | {"read": _ms(begin[k]) if k >= 0 else None})
+    return {"title": title, "lanes": lanes, "messages": messages, "notes": []}, timeline
 
 
 def cases() -> Iterator[tuple[str, Case]]:
     """Yield name and picture, one or more for each rule."""
-    yield "1_phase", _phase()
-    yield "2_schedule", _schedule()
-    yield "3_overrun", _overrun()
-    yield "3_blocking", _blocking()
-    yield "4_end", _end()
-    yield "5_order", _order()
-    yield "6_latest", _latest()
-    yield "6_buffer", _buffer()
-    yield "6_blocking", _quota()
-    yield "7_window", _window()
-
-
-def _derive(
-    nodes: Sequence[BaseNode], busy: Mapping[str, Sequence[float]], travel: Mapping[Any, Any] | None = None
-) -> Timeline:
-    ticks = lambda values: np.array([[to_ticks(v / 1000) for v in values]])  # noqa: E731
-    return derive(
-        {n.name: n for n in nodes},
-        {n: ticks(b) for n, b in busy.items()},
-        {k: ticks(t) for k, t in (travel or {}).items()},
-        int(NEVER),
-    )
-
-
-def _phase() -> Case:
     sensor, agent, actuator = (
         BaseNode(n, 50, delay=d) for n, d in [("sensor", 0.002), ("agent", 0.004), ("actuator", 0.001)]
     )
     agent.connect(sensor, delay=0.001)
     actuator.connect(agent, delay=0.002)
     sensor.connect(actuator, skip=True, delay=0.001)
-    nodes = [sensor, agent, actuator]
-    picture = case(
+    picture, _ = case(
         "Rule 1: with delays as expected, every message arrives exactly when its reader starts",
-        nodes,
-        _derive(
-            nodes,
-            {"sensor": [2, 2], "agent": [4, 4], "actuator": [1, 1]},
-            {("agent", "sensor"): [1, 1], ("actuator", "agent"): [2, 2], ("sensor", "actuator"): [1, 1]},
-        ),
+        nodes := [sensor, agent, actuator],
+        [[2, 2], [4, 4], [1, 1]],
+        {("agent", "sensor"): [1, 1], ("actuator", "agent"): [2, 2], ("sensor", "actuator"): [1, 1]},
     )
     picture["notes"] += [[n.phase * 1000, i, f"phase {n.phase * 1000:g} ms"] for i, n in enumerate(nodes)]
-    return picture
+    yield "1_phase", picture
 
-
-def _schedule() -> Case:
     fast, slow = BaseNode("50 Hz", 50), BaseNode("30 Hz", 30)
     slow.connect(fast, delay=0.008)
-    timeline = _derive([fast, slow], {"50 Hz": [3] * 6, "30 Hz": [3] * 4}, {("30 Hz", "50 Hz"): [8] * 6})
-    picture = case(
-        "Rule 2: step k is scheduled at its slot, rounded separately", [fast, slow], Timeline(timeline.vertices, {})
-    )
+    title = "Rule 2: step k is scheduled at its slot, rounded separately"
+    picture, _ = case(title, [fast, slow], [[3] * 6, [3] * 4], {("30 Hz", "50 Hz"): [8] * 6})
+    picture["messages"] = []
     for lane, node in enumerate((fast, slow)):
         for k, s in enumerate(picture["lanes"][lane]["slots"]):
             picture["notes"].append([s, lane, f"{s:g}" if node is slow and k else f"s{k} = {s:g}"])
-    return picture
+    yield "2_schedule", picture
 
-
-def _overrun() -> Case:
+    title = "Rule 3: an overrun moves the whole later schedule (FREQUENCY), or is caught up with (PHASE)"
     nodes = [BaseNode(s.name, 100, scheduling=s) for s in Scheduling]
-    busy = [3, 24, 3, 3, 3, 3]
-    return case(
-        "Rule 3: an overrun moves the whole later schedule (FREQUENCY), or is caught up with (PHASE)",
-        nodes,
-        _derive(nodes, {n.name: busy for n in nodes}),
-    )
+    yield "3_overrun", case(title, nodes, [[3, 24, 3, 3, 3, 3]] * 2)[0]
 
-
-def _blocking() -> Case:
-    sender = BaseNode("sender", 100)
-    waits, advances = BaseNode("waits", 100), BaseNode("advance=True", 100, advance=True)
+    sender, waits = BaseNode("sender", 100), BaseNode("waits", 100)
+    advances = BaseNode("advance=True", 100, advance=True)
     for reader in (waits, advances):
         reader.connect(sender, blocking=True, delay=0.004)
-    nodes = [advances, sender, waits]
-    return case(
-        "Rule 3: waiting for a message does not move the schedule; with advance a step need not wait for its slot",
-        nodes,
-        _derive(
-            nodes,
-            {"sender": [1] * 4, "waits": [2] * 4, "advance=True": [2] * 4},
-            {(r.name, "sender"): [1, 8, 1, 1] for r in (waits, advances)},
-        ),
-    )
+    title = "Rule 3: waiting for a message does not move the schedule; with advance a step need not wait for its slot"
+    travel = {(r.name, "sender"): [1, 8, 1, 1] for r in (waits, advances)}
+    yield "3_blocking", case(title, [advances, sender, waits], [[2] * 4, [1] * 4, [2] * 4], travel)[0]
 
-
-def _end() -> Case:
-    node, reader = BaseNode("sensor", 50, delay=0.006), BaseNode("reader", 50)
-    reader.connect(node, delay=0.002)
-    picture = case(
-        "Rule 4: a late thread does not change when a step starts, only how long it takes",
-        [node, reader],
-        _derive([node, reader], {"sensor": [7.5, 4], "reader": [3, 3]}, {("reader", "sensor"): [2, 2]}),
-    )
+    sensor, reader = BaseNode("sensor", 50, delay=0.006), BaseNode("reader", 50)
+    reader.connect(sensor, delay=0.002)
+    title = "Rule 4: a late thread does not change when a step starts, only how long it takes"
+    picture, _ = case(title, [sensor, reader], [[7.5, 4], [3, 3]], {("reader", "sensor"): [2, 2]})
     picture["marks"] = [[3.0, 0, "woken"], [5.0, 0, "ts"]]
     picture["notes"] += [[0.0, 0, "start"], [7.1, 0, "end"]]
-    return picture
+    yield "4_end", picture
 
-
-def _order() -> Case:
     sender, reader = BaseNode("sender", 100), BaseNode("reader", 100)
     reader.connect(sender, delay=0.003)
-    return case(
-        "Rule 5: a fast message does not overtake a slow one",
-        [sender, reader],
-        _derive(
-            [sender, reader],
-            {"sender": [2] * 5, "reader": [2] * 5},
-            {("reader", "sender"): [3, 19, 3, 3, 3]},
-        ),
-    )
+    title = "Rule 5: a fast message does not overtake a slow one"
+    yield "5_order", case(title, [sender, reader], [[2] * 5] * 2, {("reader", "sender"): [3, 19, 3, 3, 3]})[0]
 
-
-def _latest() -> Case:
     sender, plain, skips = BaseNode("sender", 100, delay=0.002), BaseNode("reader", 100), BaseNode("skip=True", 100)
     clock = BaseNode("clock", 100, delay=0.005)
     plain.connect(sender, delay=0.003)
     skips.connect(sender, delay=0.003, skip=True)
     skips.connect(clock)  # gives it the same phase
-    nodes = [plain, sender, skips]
-    travel = [3, 3, 6, 3]
-    timeline = _derive(
-        [*nodes, clock],
-        {"sender": [2] * 4, "reader": [2] * 4, "skip=True": [2] * 4, "clock": [0] * 4},
-        {("reader", "sender"): travel, ("skip=True", "sender"): travel, ("skip=True", "clock"): [5] * 4},
-    )
+    travel = {(r.name, "sender"): [3, 3, 6, 3] for r in (plain, skips)} | {("skip=True", "clock"): [5] * 4}
     title = "Rule 6: a message that arrives exactly at the start is read, or with skip left to the next step"
-    shown = {n.name for n in nodes}
-    edges = {k: e for k, e in timeline.edges.items() if {k[0], e.sender} <= shown}
-    return case(title, nodes, Timeline({n: v for n, v in timeline.vertices.items() if n in shown}, edges))
+    yield "6_latest", case(title, [plain, sender, skips], [[2] * 4] * 3 + [[0] * 4], travel, [clock])[0]
 
-
-def _buffer() -> Case:
     sender = BaseNode("sender", 100, delay=0.001)
     readers = [BaseNode(j.name, 100, delay=0.0) for j in Jitter]
     for reader, jitter in zip(readers, Jitter, strict=True):
         reader.connect(sender, delay=0.012, jitter=jitter)
-    nodes = [readers[0], sender, readers[1]]
-    travel = [2, 2, 17, 2, 2]
-    picture = case(
-        "Rule 6: LATEST reads what is there; BUFFER holds a message until its nominal arrival",
-        nodes,
-        _derive(
-            nodes,
-            {"sender": [1] * 5, **{r.name: [2] * 5 for r in readers}},
-            {(r.name, "sender"): travel for r in readers},
-        ),
-    )
-    connection = readers[1].inputs["sender"]
-    nominal = eligible(connection, np.zeros((1, 5), np.int64))[0]
+    title = "Rule 6: LATEST reads what is there; BUFFER holds a message until its nominal arrival"
+    travel = {(r.name, "sender"): [2, 2, 17, 2, 2] for r in readers}
+    picture, _ = case(title, [readers[0], sender, readers[1]], [[2] * 5, [1] * 5, [2] * 5], travel)
+    nominal = eligible(readers[1].inputs["sender"], np.zeros((1, 5), np.int64))[0]
     picture["due"] = [[value, 2] for value in _ms(nominal)]
-    return picture
+    yield "6_buffer", picture
 
-
-def _quota() -> Case:
     sender = BaseNode("50 Hz", 50)
     same, half = BaseNode("50 Hz, blocking", 50), BaseNode("25 Hz, blocking", 25)
     same.connect(sender, blocking=True, delay=0.02)
     half.connect(sender, blocking=True, delay=0.003)
-    nodes = [same, sender, half]
-    return case(
-        "Rule 6: a blocking step waits for the messages whose sender was scheduled since its last slot",
-        nodes,
-        _derive(
-            nodes,
-            {"50 Hz": [2] * 6, "50 Hz, blocking": [2] * 5, "25 Hz, blocking": [2] * 3},
-            {(same.name, "50 Hz"): [1] * 6, (half.name, "50 Hz"): [1, 1, 4, 1, 1, 1]},
-        ),
-    )
+    title = "Rule 6: a blocking step waits for the messages whose sender was scheduled since its last slot"
+    travel = {(same.name, "50 Hz"): [1] * 6, (half.name, "50 Hz"): [1, 1, 4, 1, 1, 1]}
+    yield "6_blocking", case(title, [same, sender, half], [[2] * 5, [2] * 6, [2] * 3], travel)[0]
 
-
-def _window() -> Case:
     sender, reader = BaseNode("sender", 100), BaseNode("reader, window=3", 50)
     reader.connect(sender, delay=0.003, window=3)
-    timeline = _derive(
-        [sender, reader],
-        {"sender": [2] * 8, reader.name: [2] * 4},
-        {(reader.name, "sender"): [1, 4, 1, 14, 1, 1, 1, 1]},
-    )
-    picture = case("Rule 7: a step gets the last three consumed messages, oldest first", [sender, reader], timeline)
+    title = "Rule 7: a step gets the last three consumed messages, oldest first"
+    travel = {(reader.name, "sender"): [1, 4, 1, 14, 1, 1, 1, 1]}
+    picture, timeline = case(title, [sender, reader], [[2] * 8, [2] * 4], travel)
     seq_in = timeline.edges[reader.name, "sender"].seq_in[0]
     for k, t in enumerate(picture["lanes"][1]["start"]):
         window = np.flatnonzero((seq_in >= 0) & (seq_in <= k))[-3:].tolist()
         shown = ["-"] * (3 - len(window)) + [str(m) for m in window]
         picture["notes"].append([t + 1, 1, f"gets {', '.join(shown)}"])
-    return picture
+    yield "7_window", picture
 
 
 def _ms(ticks: Any) -> Any:
