@@ -179,7 +179,7 @@ def test_a_bag_that_was_cut_is_read_up_to_there(tmp_path, share):
     assert any("cut or damaged" in note for note in table.notes)
 
 
-@pytest.mark.parametrize("seed", range(30))
+@pytest.mark.parametrize("seed", range(12))
 def test_bytes_changed_at_random_are_read_or_refused(tmp_path, seed):
     rng = np.random.default_rng(seed)
     data = bytearray(bags.write(tmp_path / "x.mcap", bags.rows(stop=60)).read_bytes())

@@ -4,12 +4,11 @@ import re
 
 import numpy as np
 import pytest
-from foreign_robots import MODEL, VENDOR, csv, draw, faults, imported, motion, proposed, save
+from foreign_robots import MODEL, VENDOR, csv, imported, motion, proposed
 
 from sim2real import cli
 from sim2real.errors import UsageError
 from sim2real.log import load_mapping, read_log
-from sim2real.log.importing.importer import import_table
 from sim2real.log.importing.names import columns_of, is_unit, meaning
 from sim2real.log.importing.propose import ImportHints, propose
 from sim2real.log.importing.readers import joined, open_tables
@@ -94,30 +93,6 @@ def test_a_question_stands_in_the_file_and_an_edited_line_answers_it(tmp_path, m
     assert cli.main(["import", "run.csv"]) == 2, "an edited file is not overwritten"
     assert 'unit = "deg"' in (tmp_path / "run.import.toml").read_text()
     assert cli.main(["import", "run.csv", "--unit", "deg", "--out", "other.mcap"]) == 0
-
-
-@pytest.mark.parametrize("seed", range(0, 42, 7))
-def test_true_answers_make_a_drawn_log_right(tmp_path, seed):
-    """Signs and units of random robots, as a user would write them into the file."""
-    log = draw(seed)
-    while "percent" in log.units or not log.named or log.asked:
-        seed += 100
-        log = draw(seed)
-    path = save(log, tmp_path)
-    try:
-        found = proposed(path)
-    except UsageError:
-        return
-    text = found.toml()
-    units = {"counts": "counts:4096"}
-    for node, unit in (("sensor", log.units[0]), ("actuator", log.units[1])):
-        head, mark, tail = text.partition(f"[nodes.{node}.fields.")
-        tail = re.sub(r"^# unit = .*$", f'unit = "{units.get(unit, unit)}"', tail, count=1, flags=re.MULTILINE)
-        text = head + mark + re.sub(r"^# scale = .*$", f"scale = {log.sign.tolist()}", tail, flags=re.MULTILINE)
-    (tmp_path / "m.toml").write_text(text)
-    mapping = load_mapping(tmp_path / "m.toml")
-    found.evidence += [f"{j} not checked" for j in log.joints if not any("scale" in key for key in found.questions)]
-    assert [f for f in faults(log, import_table(open_tables(path)[0], mapping), found) if "positions" in f] == []
 
 
 def test_a_vendors_names_are_matched_by_leg_and_number(tmp_path):
