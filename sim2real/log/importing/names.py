@@ -172,34 +172,26 @@ def columns_of(joints: Sequence[str], labels: Sequence[str]) -> tuple[list[int],
 
 def _by_leg(names: Sequence[str]) -> list[tuple[str, int]] | None:
     """Return leg and number of the part, 0 for the hip, of each name; None if one has no leg or no part."""
-    found: list[tuple[str, int]] = []
-    numbered: list[bool] = []
+    legs: list[str] = []
+    parts: list[str] = []
+    either = "|".join(_LEGS)
     for name in names:
         words = [w.lower() for w in _WORDS.findall(name)]
-        text = "".join(
-            _LEG_WORDS.get(w) or w for w in words if w not in _FILLERS and w not in ("leg", "joint", "motor")
-        )
-        first, last = (re.fullmatch(form, text) for form in (f"({'|'.join(_LEGS)})(.+)", f"(.+)({'|'.join(_LEGS)})"))
-        if first is not None:
-            leg, part = _LEGS[first[1]], first[2]
-        elif last is not None:
-            leg, part = _LEGS[last[2]], last[1]
-        else:
+        text = "".join(_LEG_WORDS.get(w, w) for w in words if w not in _FILLERS and w != "leg")
+        match = re.fullmatch(f"({either})(.+)|(.+)({either})", text)
+        if match is None:
             return None
-        number = int(part) if part.isdigit() else _PART.get(part)
-        if number is None:
-            return None
-        numbered.append(part.isdigit())
-        found.append((leg, number))
-    if any(numbered) and not all(numbered):
-        return None
+        legs.append(_LEGS[match[1] or match[4]])
+        parts.append(match[2] or match[3])
+    if not any(part.isdigit() for part in parts):
+        return None if set(parts) - set(_PART) else [(leg, _PART[p]) for leg, p in zip(legs, parts, strict=True)]
     # Numbers count from 0 or from 1, in each leg alike.
-    low = min((n for _, n in found), default=0)
-    if any(numbered) and (
-        low not in (0, 1) or len({leg for leg, _ in found}) * len({n for _, n in found}) != len(found)
-    ):
+    if not all(part.isdigit() for part in parts):
         return None
-    return [(leg, n - low if numbered[0] else n) for leg, n in found]
+    numbers = [int(part) for part in parts]
+    if min(numbers) > 1 or len(set(legs)) * len(set(numbers)) != len(names):
+        return None
+    return [(leg, n - min(numbers)) for leg, n in zip(legs, numbers, strict=True)]
 
 
 _LEG_WORDS = {"front": "f", "fore": "f", "rear": "r", "hind": "r", "back": "r", "left": "l", "right": "r"}
