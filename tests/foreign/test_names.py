@@ -183,6 +183,12 @@ def test_gains_torque_switches_and_velocities_go_along(tmp_path):
     assert any("'kd'" in line for line in found.evidence)
 
 
+def test_a_gain_that_is_logged_rarely_drops_no_commands(tmp_path):
+    kp = np.where(np.arange(len(T)) % 25 == 0, 8.0, np.nan)
+    with pytest.raises(UsageError, match="kp"):
+        proposed(table(tmp_path, kp=kp))
+
+
 def test_names_of_files_of_one_recording_are_no_joints(tmp_path):
     sent = csv(tmp_path / "run1.csv", {"t_s": T, "goal_a_rad": GOAL[:, 0], "goal_b_rad": GOAL[:, 1]})
     read = csv(tmp_path / "q2.csv", {"t_s": T, "q_a_rad": Q[:, 0], "q_b_rad": Q[:, 1]})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -147,7 +147,8 @@ class Proposal:
         self.mapping = ImportMapping(self.hints.pipeline, nodes)
         self.evidence += about_torque({n: msgspec.to_builtins(node) for n, node in nodes.items()})
         self.add_unused()
-        self.check(by_name, inferred)
+        lacking = {n for n, s in sides.items() if not (np.isfinite(s.values).all() and np.isfinite(clocks[n][1]).all())}
+        self.check(by_name, inferred, lacking)
 
     # -- positions, commands, and their joints
 
@@ -459,11 +460,20 @@ class Proposal:
 
     # -- what the data say
 
-    def check(self, by_name: bool, inferred: Sequence[tuple[str, str]]) -> None:
-        """Give the mapping the policies that the data need; refuse or ask what the data contradict."""
+    def check(self, by_name: bool, inferred: Sequence[tuple[str, str]], lacking: Container[str]) -> None:
+        """Give the mapping the policies that the data need; refuse or ask what the data contradict.
+
+        Args:
+            by_name: Whether names say which goal belongs to which position.
+            inferred: Fields whose unit is that of the other side.
+            lacking: Nodes whose positions, commands or stamps lack a number in some samples; a gain that lacks one is
+                refused, as most of the commands could be dropped with it.
+        """
         goal = self.mapping.nodes["actuator"].fields.get("goal")
         drops = {
-            name: {"missing": "drop", "implausible": "drop"} | ({"repeated": "first"} if node.stamps else {})
+            name: {"implausible": "drop"}
+            | ({"missing": "drop"} if name in lacking else {})
+            | ({"repeated": "first"} if node.stamps else {})
             for name, node in self.mapping.nodes.items()
         }
         try:
