@@ -177,7 +177,7 @@ def _by_leg(names: Sequence[str]) -> list[tuple[str, int]] | None:
     either = "|".join(_LEGS)
     for name in names:
         words = [w.lower() for w in _WORDS.findall(name)]
-        text = "".join(_LEG_WORDS.get(w, w) for w in words if w not in _FILLERS and w != "leg")
+        text = "".join(_LEG_WORDS.get(w) or w for w in words if w not in _FILLERS and w != "leg")
         match = re.fullmatch(f"({either})(.+)|(.+)({either})", text)
         if match is None:
             return None
