@@ -27,8 +27,8 @@ CONTRACT = Contract(
 
 @pytest.fixture(autouse=True)
 def few_windows(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Replay a third of the windows, which takes a third of the time."""
-    monkeypatch.setattr(plant, "_WINDOWS", 13)
+    """Replay a quarter of the windows, which takes a quarter of the time."""
+    monkeypatch.setattr(plant, "_WINDOWS", 10)
 
 
 def recorded(folder: Path, kp: float = 1.0, limit: float = 1e6, delay_s: float = 0.01, rate: float = 50.0) -> Path:

@@ -93,14 +93,6 @@ def test_a_fault_is_found_before_a_motor_moves(arm, tmp_path, fault):
 
 
 @pytest.mark.night  # `make test` plays the motion to HandMotion in test_so101_hand_motion.py
-def test_a_right_calibration_is_accepted(arm, tmp_path):
-    right = arm()
-    calibrate(right.port, GUIDE, tmp_path / "calibration.json")
-    assert json.loads((tmp_path / "calibration.json").read_text()) == GOOD
-    assert modes(right) <= {OperatingMode.OFF}
-
-
-@pytest.mark.night  # as above
 def test_without_a_calibration_the_motion_makes_one(arm, tmp_path, monkeypatch):
     """Its zeros are those of the arm. Before, the encoders' seam was inside of the joints' travel."""
     new = arm(emulation={"homing_offset": 1900})

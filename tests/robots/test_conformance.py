@@ -8,7 +8,8 @@ from sim2real.stages.load import load_robot
 
 
 @pytest.mark.parametrize(
-    "name", ["pendulum", "arm", pytest.param("so101", marks=pytest.mark.night), "disk", "xl330", "so101_log"]
+    "name",
+    ["pendulum", *(pytest.param(n, marks=pytest.mark.night) for n in ("arm", "so101")), "disk", "xl330", "so101_log"],
 )
 def test_every_pipeline_here_has_a_robot(name, tmp_path, virtual_robots):
     pipeline = load_robot(name)

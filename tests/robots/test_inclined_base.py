@@ -41,7 +41,8 @@ def found(tmp_path, angle, fix=None):
     return inclined(inputs, SimpleNamespace(problem=SimpleNamespace(table=SimpleNamespace(terms=())), values=values))
 
 
-@pytest.mark.parametrize("angle", [0.7, pytest.param(3.1, marks=pytest.mark.night)])
+@pytest.mark.night
+@pytest.mark.parametrize("angle", [0.7, 3.1])
 def test_the_turn_of_gravity_is_found_with_its_command(tmp_path, angle):
     share, turns, flags = found(tmp_path, angle)
     assert share > 0.9

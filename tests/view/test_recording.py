@@ -155,6 +155,7 @@ def test_a_place_that_cannot_be_written_is_named(run):
         view(run, run / "record" / "session.mcap" / "run.rrd")
 
 
+@pytest.mark.night
 def test_importing_the_room_imports_no_viewer():
     code = "import sys, sim2real.view.rerun_recording, sim2real.view.page; sys.exit('rerun' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
