@@ -38,7 +38,6 @@ BENCHES = {
     "legs-identify": ("legs_identify", "hidden Go2s: the errors of identified parameters and delays"),
     "pays": ("pays", "what identification is worth: four ways to train, judged on the same hidden robots"),
     "randomise": ("hidden.randomise", "success on hidden robots by what the training was given"),
-    "runner": ("runner", "a step of a policy in numpy, and the loop of an emulated Go2 at 500 Hz"),
     "scaling": ("train", "training on all devices of a host against one"),
     "so101": ("runs.arm", "the SO-101's whole run"),
     "train": ("train", "PPO on the pendulum with its delays"),

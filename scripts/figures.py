@@ -34,7 +34,6 @@ TABLES = {
     "warp": ("compose.table", "compose_warp_h200"),
     "drift": ("drift.table", "drift_so101"),
     "devices": ("train.scaling", "scaling_h200"),
-    "runner": ("runner.table", "runner"),
     "walk": ("walk.table", "walk"),
     "legs_identify": ("legs_identify.table", "legs_identify"),
     "walk_delays": ("walking.delays.table", "walk_delays"),

@@ -16,7 +16,7 @@ import canary  # noqa: E402
 import figures  # noqa: E402
 from benches.rows import missed, row, text_of  # noqa: E402
 
-PROCESSES = ("arm", "demo", "runner", "so101")
+PROCESSES = ("arm", "demo", "so101")
 """Benches that start robots or keep deadlines on the wall clock."""
 ON_A_GPU = ("walk-train",)
 FLAGS = {"compose": ["--parts", "step"], "graph": ["--mjx", "0"], "randomise": ["--ways", "all", "--record-s", "12"]}
