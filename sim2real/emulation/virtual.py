@@ -11,7 +11,7 @@ import math
 import tempfile
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -22,10 +22,9 @@ from sim2real.emulation.faults import truth_header
 from sim2real.emulation.plant import Plant, load_plant
 from sim2real.emulation.truth import Truth, TruthLog, read_truth
 from sim2real.errors import HardwareLost
-from sim2real.hardware.bus.port import EMULATED, Port
+from sim2real.hardware.bus.port import CUT, EMULATED, Port, Queries, take_torque_off
 from sim2real.hardware.clock import Clock
-from sim2real.hardware.safety.guardian import Guardian
-from sim2real.hardware.safety.guardian_process import BusGuard, FdPort, Guard
+from sim2real.hardware.safety.guardian import Guard, Guardian, Motors
 
 NUMBERS: Final = count()
 
@@ -156,11 +155,10 @@ class VirtualChannel:
 
     pid = 0
 
-    def __init__(self, robot: VirtualTime, guard: Guard, longest_s: float) -> None:
+    def __init__(self, robot: VirtualTime, motors: Motors, longest_s: float) -> None:
         self.clock: Clock = robot
         self._robot, self._messages = robot, b""
-        robot.watch(guard)
-        guard.begin(longest_s, self._say, robot.reports.append)
+        robot.watch(Guard(motors, longest_s, self._say, robot.reports.append))
 
     def _say(self, message: bytes) -> None:
         self._messages += message
@@ -253,13 +251,11 @@ class VirtualRobot(VirtualTime):
         self._baud_rate = None
         self._inbox.clear()
 
-    def guardian(
-        self, off: bytes, servos: Sequence[tuple[bytes, Sequence[bytes]]], silence_s: float, answer_s: float
-    ) -> Guardian:
+    def guardian(self, off: bytes, servos: Queries, silence_s: float, answer_s: float) -> Guardian:
         """Return a guardian that acts in virtual time."""
-        rows = [(query, list(answers)) for query, answers in servos]
-        guard = BusGuard(_GuardPort(self), answer_s, off, rows)
-        return Guardian(lambda longest_s: VirtualChannel(self, guard, longest_s), silence_s)
+        line = _GuardLine(self)
+        motors = Motors(lambda: take_torque_off(line, off, servos, answer_s), self, CUT)
+        return Guardian(lambda longest_s: VirtualChannel(self, motors, longest_s), silence_s)
 
     def _require_port(self) -> None:
         if self._baud_rate is None or not self.host_lives:
@@ -293,18 +289,15 @@ class VirtualRobot(VirtualTime):
         self.bus.run_until(t_ns)
 
 
-class _GuardPort(FdPort):
-    """The virtual port, as the guardian's own code uses it; see `FdPort`."""
+class _GuardLine:
+    """The virtual port, as the guardian's own code uses it."""
 
     def __init__(self, robot: VirtualRobot) -> None:
+        self.clock: Clock = robot
         self._robot = robot
-
-    def now_s(self) -> float:
-        return 1e-9 * self._robot.now_ns()
 
     def write(self, packet: bytes) -> None:
         self._robot._feed(packet)
 
-    def receive(self, wait_s: float) -> bytes:
-        # At least 1 ns, so that time goes on.
-        return self._robot._take_until(self._robot.now_ns() + max(1, round(1e9 * wait_s)))
+    def read(self, until_ns: int) -> bytes:
+        return self._robot._take_until(max(until_ns, self._robot.now_ns() + 1))  # time goes on

@@ -15,7 +15,7 @@ from sim2real.emulation.virtual import NUMBERS, VirtualChannel, VirtualTime
 from sim2real.errors import HardwareLost
 from sim2real.hardware.safety.guardian import Guardian
 from sim2real.hardware.unitree.dds import EMULATED, QUEUE, Address, DdsLink
-from sim2real.hardware.unitree.guardian_process import LegGuard
+from sim2real.hardware.unitree.device import motors_of
 from sim2real.hardware.unitree.legs import LegDrive
 from sim2real.hardware.unitree.messages import LowCmd, LowState
 
@@ -103,8 +103,8 @@ class VirtualLink(DdsLink):
 
     def guardian(self, drive: LegDrive, silence_s: float, settle_s: float) -> Guardian:
         """Return a guardian that acts in virtual time."""
-        guard = LegGuard(VirtualLink(self._robot, self._mark.decode(), is_guardian=True), drive)
-        return Guardian(lambda longest_s: VirtualChannel(self._robot, guard, longest_s), silence_s, settle_s)
+        motors = motors_of(VirtualLink(self._robot, self._mark.decode(), is_guardian=True), drive)
+        return Guardian(lambda longest_s: VirtualChannel(self._robot, motors, longest_s), silence_s, settle_s)
 
     def close(self) -> None:
         """Leave the domain. May be called twice."""

@@ -96,7 +96,8 @@ def test_no_joint_of_first_order_is_stopped(delay, time_constant, weight, goals)
         t_s = 0.005 * k
         if k % 20 == 0:
             sent.append((t_s, goals[k // 20]))
-            check.sent(np.array([goals[k // 20]]), t_s)
+            check.sending(np.array([goals[k // 20]]), t_s)
+            check.sent(t_s)
         goal = next(value for since_s, value in reversed(sent) if since_s <= t_s - delay)
         position += (1.0 - math.exp(-0.005 / time_constant)) * (goal + weight - position)
         if k % 4 == 0:
@@ -117,6 +118,20 @@ def test_a_weak_motor_is_named_by_its_missing_torque():
         check.check(zero, still, np.array([0.0, 30.0]), 0.002 * k)
     with pytest.raises(SafetyStop, match=r"calf .* N m"):
         let_go(check, still, 0.1, 0.2)
+
+
+def test_a_command_that_is_held_up_on_its_way_is_not_obeyed_yet():
+    """A busy computer may stop a thread between its decision to send a goal and the port."""
+    following = Following(0.1, 0.2, 2.0)
+    check = FollowingCheck(following, np.zeros(1), 0.0, str)
+    check.sending(np.full(1, 0.5), 0.1)
+    for t_s in np.arange(0.1, 1.0, 0.02):
+        check.check(np.zeros(1), np.zeros(1), np.zeros(1), t_s)
+    check.sent(1.0)
+    for t_s in np.arange(1.0, 1.19, 0.02):
+        check.check(np.zeros(1), np.zeros(1), np.zeros(1), t_s)
+    with pytest.raises(SafetyStop):
+        let_go(check, np.zeros(1), 1.2, 1.5)
 
 
 FIRST = np.array([-0.8, 0.5, -1.0])

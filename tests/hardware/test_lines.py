@@ -8,7 +8,7 @@ import pytest
 from families import IDS, STS, VOLTS
 
 from sim2real.errors import HardwareLost, SafetyStop
-from sim2real.hardware.safety import guardian_process
+from sim2real.hardware.safety import guardian
 
 SPEED_RAD_S = {VOLTS: 40.0, STS: 10.0}
 """Of the plant, whatever is commanded: a position says when it was sampled. A count is 0.04 or 0.15 ms."""
@@ -82,7 +82,7 @@ def check(seeds):
 
 @pytest.fixture(autouse=True)
 def quiet_and_impatient(monkeypatch):
-    monkeypatch.setattr(guardian_process, "GIVE_UP_S", 0.5)
+    monkeypatch.setattr(guardian, "GIVE_UP_S", 0.5)
     logging.disable(logging.CRITICAL)
     yield
     logging.disable(logging.NOTSET)

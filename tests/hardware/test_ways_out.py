@@ -11,7 +11,7 @@ from families import ANGLES, BOARD, LEGS, ROBOTS, SERVOS, VOLTS
 from sim2real.emulation.truth import Kind
 from sim2real.errors import HardwareLost, SafetyStop
 from sim2real.hardware.bus.packets import Instruction
-from sim2real.hardware.safety import guardian_process
+from sim2real.hardware.safety import guardian
 
 PERIOD_S = 0.02
 SILENCE_S = 0.1
@@ -22,7 +22,7 @@ BEGIN_S = 0.3
 @pytest.fixture(autouse=True)
 def impatient_guardian(monkeypatch):
     """A guardian tries for 1 s instead of 10 to reach motors that are silent."""
-    monkeypatch.setattr(guardian_process, "GIVE_UP_S", 1.0)
+    monkeypatch.setattr(guardian, "GIVE_UP_S", 1.0)
 
 
 def strike(**faults):

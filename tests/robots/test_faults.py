@@ -12,7 +12,7 @@ from embedded import HZ, drive, make
 from sim2real.emulation.truth import Kind
 from sim2real.errors import HardwareLost, SafetyStop
 from sim2real.hardware.bus.packets import Instruction
-from sim2real.hardware.safety import guardian_process
+from sim2real.hardware.safety import guardian
 
 ROBOTS = ("pendulum", "arm", "so101", *(("go2",) if importlib.util.find_spec("cyclonedds") else ()))
 SEEDS = range(4)
@@ -154,7 +154,7 @@ def check(name, fault, seed):
 
 @pytest.fixture(autouse=True)
 def impatient_guardian(monkeypatch):
-    monkeypatch.setattr(guardian_process, "GIVE_UP_S", 1.0)
+    monkeypatch.setattr(guardian, "GIVE_UP_S", 1.0)
 
 
 def test_the_table_has_its_rows():

@@ -1,6 +1,7 @@
 """The embedded robots, watched while a policy runs: a joint that lets go is named, and no sound robot is stopped."""
 
 import importlib.util
+import random
 from functools import cache, partial
 
 import pytest
@@ -13,14 +14,36 @@ ROBOTS = ("arm", "so101", "pendulum", *(("go2",) if importlib.util.find_spec("cy
 robot_of = cache(make)
 
 
-def sound(name, seed, share):
+def hold_up(emulated, rng):
+    """Let a busy computer stop the host now and then: between the time of an instruction and its bytes."""
+    write = emulated.write
+
+    def held_up(data):
+        if rng.random() < 0.1:
+            emulated.stall(rng.choice([0.006, 0.03, 0.12]))
+        write(data)
+
+    emulated.write = held_up
+
+
+def sound(name, seed, share, busy=None):
     """Drive a robot that has no fault; ``share``: of the largest payload. It must not be stopped."""
     robot, by_model = robot_of(name), seed % 2 == 0
     plant = {"carried_kg": share * robot.model.hand.most_kg} if share and name in ("arm", "so101") else None
     emulated = robot.robot(seed, {"seed": seed} if name == "go2" else plant)
     with robot.rig(emulated, by_model or None, robot.limits.on("embedded")) as rig:
-        drive(emulated, rig, partial(robot.policy, seed), 4.0)
+        if busy is not None and name != "go2":
+            hold_up(emulated, busy)
+        stalls = (lambda t_s: None) if busy is None else lambda t_s: emulated.stall(0.3 * max(0.0, busy.uniform(-9, 1)))
+        drive(emulated, rig, partial(robot.policy, seed), 4.0, stalls)
     emulated.stop()
+
+
+@pytest.mark.parametrize("seed", range(2, 6))
+@pytest.mark.parametrize("name", ROBOTS)
+def test_a_host_that_is_held_up_does_not_look_like_a_joint_that_lets_go(name, seed):
+    """Between its steps, and on the way to the port."""
+    sound(name, seed, 0.0, random.Random(seed))
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0])

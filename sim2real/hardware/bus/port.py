@@ -5,11 +5,12 @@ import select
 import termios
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final, Protocol, Self, cast
+from typing import Final, Protocol, Self, TypeAlias, cast
 
 from sim2real.errors import HardwareLost, UsageError
 from sim2real.hardware.clock import SYSTEM_CLOCK, Clock
-from sim2real.hardware.safety.guardian import BusGuardian, Guardian
+from sim2real.hardware.safety import guardian
+from sim2real.hardware.safety.guardian import Guardian, Motors, Process
 
 
 @dataclass(frozen=True)
@@ -47,14 +48,19 @@ class BusConfig:
                 raise UsageError(f"{name} = {getattr(self, name)} is not a time")
 
 
-class Port(Protocol):
-    """Bytes from and to a device, on the device's clock. Every method may be called from any thread.
+Queries: TypeAlias = Sequence[tuple[bytes, Sequence[bytes]]]
+"""For each servo, the packet that reads its torque register, and the answers that mean "off"."""
+CUT: Final = "cut the servos' power"
+_QUIET_NS, _LONGEST_ANSWER_NS = 2_000_000, 20_000_000
 
-    Attributes:
-        clock: The time of the device.
-    """
 
-    clock: Clock
+class Line(Protocol):
+    """Bytes from and to a device, on the device's clock. Every method may be called from any thread."""
+
+    @property
+    def clock(self) -> Clock:
+        """The time of the device."""
+        ...
 
     def write(self, data: bytes) -> None:
         """Send bytes without waiting; OSError if that cannot be done."""
@@ -64,6 +70,10 @@ class Port(Protocol):
         """Return the bytes that have arrived; none if there are none until a time [ns]; OSError if the port is gone."""
         ...
 
+
+class Port(Line, Protocol):
+    """A line that is open alone."""
+
     def flush(self) -> None:
         """Drop the bytes that have arrived; OSError if the port is gone."""
         ...
@@ -72,15 +82,43 @@ class Port(Protocol):
         """Close the port; OSError if that cannot be done."""
         ...
 
-    def guardian(
-        self, off: bytes, servos: Sequence[tuple[bytes, Sequence[bytes]]], silence_s: float, answer_s: float
-    ) -> Guardian:
-        """Return a guardian of the servos on this port, which has started; see `BusGuardian`."""
+    def guardian(self, off: bytes, servos: Queries, silence_s: float, answer_s: float) -> Guardian:
+        """Return a guardian of the servos on this port, which has started.
+
+        Args:
+            off: The packet that takes the torque of all servos off.
+            silence_s: As in `Guardian` [s].
+            answer_s: Longest wait for a servo's answer [s].
+        """
         ...
 
 
-class SerialPort:
-    """A serial port of this computer, which no other process can open meanwhile.
+class FdPort:
+    """An open serial port, by its file descriptor, which the guardian's process shares."""
+
+    def __init__(self, fd: int) -> None:
+        self.clock: Clock = SYSTEM_CLOCK
+        self._fd = fd
+
+    def write(self, data: bytes) -> None:
+        os.write(self._fd, data)
+
+    def read(self, until_ns: int) -> bytes:
+        # What has arrived counts, also if this thread did not run until after that time.
+        left_s = max(0.0, (until_ns - self.clock.now_ns()) * 1e-9)
+        if not select.select([self._fd], [], [], left_s)[0]:
+            return b""
+        try:
+            data = os.read(self._fd, 4096)
+        except BlockingIOError:  # the other process has read it
+            return b""
+        if not data:
+            raise OSError("the port is ready to be read, but has no data: was it unplugged?")
+        return data
+
+
+class SerialPort(FdPort):
+    """A serial port of this computer, which no other process can open meanwhile; a `Port`.
 
     Raises:
         HardwareLost: It cannot be opened, or another process uses it.
@@ -91,7 +129,6 @@ class SerialPort:
         import serial
         from serial.tools import list_ports
 
-        self.clock: Clock = SYSTEM_CLOCK
         try:
             self._serial = serial.Serial(address, baud_rate, timeout=0, exclusive=True)
         except (OSError, ValueError) as error:  # serial.SerialException is an OSError
@@ -100,40 +137,71 @@ class SerialPort:
                 f"serial port {address} cannot be opened: {error}",
                 hint=f"serial ports here: {ports}; a port that is there but refused needs group 'dialout'",
             ) from error
-        self._fd = cast(int, self._serial.fileno())
-
-    def write(self, data: bytes) -> None:
-        """Send bytes without waiting; OSError if that cannot be done."""
-        os.write(self._fd, data)
-
-    def read(self, until_ns: int) -> bytes:
-        """Return the bytes that have arrived; none if there are none until a time [ns]; OSError if the port is gone."""
-        # What has arrived counts, also if this thread did not run until after that time.
-        left_s = max(0.0, (until_ns - self.clock.now_ns()) * 1e-9)
-        if not select.select([self._fd], [], [], left_s)[0]:
-            return b""
-        data = os.read(self._fd, 4096)
-        if not data:
-            raise OSError("the port is ready to be read, but has no data: was it unplugged?")
-        return data
+        super().__init__(cast(int, self._serial.fileno()))
 
     def flush(self) -> None:
-        """Drop the bytes that have arrived; OSError if the port is gone."""
         try:
             self._serial.reset_input_buffer()
         except termios.error as error:  # raised by pyserial when the adapter is unplugged
             raise OSError(str(error)) from error
 
     def close(self) -> None:
-        """Close the port; OSError if that cannot be done."""
         self._fd = -1  # the operating system gives the number to the next file that is opened
         self._serial.close()
 
-    def guardian(
-        self, off: bytes, servos: Sequence[tuple[bytes, Sequence[bytes]]], silence_s: float, answer_s: float
-    ) -> Guardian:
-        """Return a guardian in a process of its own, which shares the open port and its lock."""
-        return BusGuardian(self._fd, off, servos, silence_s, answer_s)
+    def guardian(self, off: bytes, servos: Queries, silence_s: float, answer_s: float) -> Guardian:
+        """Start a guardian in a process of its own, which shares the open port: no other process gets it meanwhile."""
+        packets = [f"{query.hex()}:{','.join(answer.hex() for answer in answers)}" for query, answers in servos]
+        arguments = [str(self._fd), repr(answer_s), off.hex(), *packets]
+        place = f"{__name__}:guarded"
+        return Guardian(lambda longest_s: Process(place, arguments, longest_s, (self._fd,)), silence_s)
+
+
+def guarded(fd: str, answer_s: str, off: str, *servos: str) -> Motors:
+    """Return the servos that a guardian's process watches; packets are hexadecimal, see `SerialPort.guardian`."""
+    packets = [text.partition(":") for text in servos]
+    queries = [(bytes.fromhex(q), [bytes.fromhex(a) for a in answers.split(",")]) for q, _, answers in packets]
+    port = FdPort(int(fd))
+    return Motors(lambda: take_torque_off(port, bytes.fromhex(off), queries, float(answer_s)), cut=CUT)
+
+
+def take_torque_off(port: Line, off: bytes, servos: Queries, answer_s: float) -> str:
+    """Switch all servos off, repeatedly until each has confirmed it; return why one did not, else "".
+
+    Repeatedly, as the first packet is lost if the control process died while it was writing one, and as the control
+    process, if it resumes, may read an answer in place of this one. Arguments as in `Port.guardian`.
+    """
+    clock, unconfirmed = port.clock, list(servos)
+    begin_ns = clock.now_ns()
+    try:
+        # Wait until no more bytes arrive: on a half-duplex line, sending now would collide with an answer.
+        while clock.now_ns() - begin_ns < _LONGEST_ANSWER_NS and port.read(clock.now_ns() + _QUIET_NS):
+            pass
+        while unconfirmed and clock.now_ns() - begin_ns < 1e9 * guardian.GIVE_UP_S:
+            _write(port, off)
+            unconfirmed = [servo for servo in unconfirmed if not _confirms(port, *servo, answer_s)]
+    except OSError as error:
+        return f"the port failed: {error}"
+    if not unconfirmed:
+        return ""
+    return f"{len(unconfirmed)} of {len(servos)} servos did not answer for {guardian.GIVE_UP_S:g} s"
+
+
+def _write(port: Line, packet: bytes) -> None:
+    try:
+        port.write(packet)
+    except BlockingIOError:  # the buffer is full, and the packet lost
+        port.clock.sleep(1e-9 * _QUIET_NS)
+
+
+def _confirms(port: Line, query: bytes, answers: Sequence[bytes], answer_s: float) -> bool:
+    _write(port, query)
+    end_ns, heard = port.clock.now_ns() + round(1e9 * answer_s), b""
+    while port.clock.now_ns() < end_ns:
+        heard += port.read(end_ns)
+        if any(answer in heard for answer in answers):
+            return True
+    return False
 
 
 EMULATED: Final[dict[str, Callable[[int], Port]]] = {}

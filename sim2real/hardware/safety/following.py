@@ -24,6 +24,10 @@ _SAMPLES: Final = 3
 _PARTS: Final = 10
 """Parts of the time between two measurements for which the command is looked up."""
 _SLOW_RAD_S: Final = 0.5
+_LONGEST_S: Final = 0.05
+"""Between two measurements farther apart, as of a host that was held up, forces change too much to tell a push [s]."""
+_UNSURE: Final = 0.25
+"""Share of the time between two measurements by which their times, or those of commands, may be uncertain."""
 _ENOUGH: Final = 1.0
 """Sum of the squares of a joint's changes of speed from which on they tell, against noise of 0.05 rad/s [rad^2/s^2]."""
 
@@ -75,8 +79,20 @@ class Following:
         return "1" if self.push is not None else "rad" if self.most_nm is None else "N m"
 
 
+@dataclass
+class _Sent:
+    """A command; between its two times it began to act. While it is being sent, the second one is not known."""
+
+    command: np.ndarray
+    begin_s: float
+    end_s: float = np.inf
+
+
 class FollowingCheck:
     """Compares measurements with commands; see `Following`. Both may come from different threads.
+
+    A host that is held up does not look like a joint that lets go: a command counts as obeyed only after it was sent,
+    and pushes are compared over times that are certain.
 
     Args:
         start: Command that the joints follow at the start, ``(n,)`` [rad], or ``(n, 5)`` as in `Following`.
@@ -90,24 +106,36 @@ class FollowingCheck:
         both = np.broadcast_to(np.asarray(following.speed_rad_s, np.float64), n)
         self._speeds = following.speeds or (lambda _: (both, both))
         self._lock = threading.Lock()
-        self._commands: list[tuple[float, np.ndarray]] = [(t_s, np.array(start, np.float64))]
-        self._low = self._high = self._commands[0][1]
+        self._commands = [_Sent(np.array(start, np.float64), t_s, t_s)]
+        self._low = self._high = self._commands[0].command
         self._place = self._low, self._high
         self._position = np.array(self._low if following.most_nm is None else self._low[:, 0])
         self._t_s = t_s
         self._weak, self._law = np.zeros(n), np.zeros(n)
         self._moved: list[tuple[float, np.ndarray, np.ndarray]] = []
         self._velocity: np.ndarray | None = None
+        self._unsure_s = 0.0
         # Since when each joint is beyond its limit, and for how many samples.
         self._since_s, self._count = np.zeros(n), np.zeros(n, np.int64)
 
-    def sent(self, command: np.ndarray, t_s: float) -> None:
-        """Note a command that is sent at a time [s]."""
+    def sending(self, command: np.ndarray, t_s: float) -> None:
+        """Note a command that begins to be sent at a time [s]."""
         with self._lock:
-            self._commands.append((t_s, np.array(command, np.float64)))
+            self._commands.append(_Sent(np.array(command, np.float64), t_s))
 
-    def check(self, position_rad: np.ndarray, velocity_rad_s: np.ndarray, load: np.ndarray, t_s: float) -> None:
-        """Check a measurement that was taken at a time [s]; arrays ``(n,)``.
+    def sent(self, t_s: float) -> None:
+        """Note that the last command has been sent at a time [s]."""
+        with self._lock:
+            self._commands[-1].end_s = t_s
+
+    def check(
+        self, position_rad: np.ndarray, velocity_rad_s: np.ndarray, load: np.ndarray, t_s: float, unsure_s: float = 0.0
+    ) -> None:
+        """Check a measurement; arrays ``(n,)``.
+
+        Args:
+            t_s: Its time [s].
+            unsure_s: By how much later it may have been taken [s].
 
         Raises:
             SafetyStop: A joint does not follow its commands.
@@ -115,16 +143,23 @@ class FollowingCheck:
         with self._lock:
             # Keep the commands of the response's time, and the one before.
             commands = self._commands
-            while len(commands) > 1 and commands[1][0] <= t_s - self._following.response_s:
+            while len(commands) > 1 and commands[1].end_s <= t_s - self._following.response_s:
                 commands.pop(0)
-            times, recent = np.array([sent_s for sent_s, _ in commands]), np.array([command for _, command in commands])
+            recent = list(commands)
         elapsed_s, self._t_s = max(0.0, t_s - self._t_s), t_s
         if self._following.push is not None:
-            off = self._missing_push(times, recent, position_rad, velocity_rad_s, elapsed_s)
+            off = self._missing_push(recent, position_rad, velocity_rad_s, elapsed_s, unsure_s)
         elif self._following.most_nm is None:
-            off = self._distance(recent, position_rad, elapsed_s)
+            goals = np.array([sent.command for sent in recent])
+            off = self._distance(goals, position_rad, elapsed_s)
         else:
-            off = self._weakness(recent[-1], position_rad, velocity_rad_s, load, elapsed_s)
+            # The robot obeys the last command that was sent, or one that is being sent.
+            obeyed = [
+                sent.command
+                for sent, then in zip(recent, [*recent[1:], None], strict=True)
+                if then is None or then.end_s > t_s
+            ]
+            off = self._weakness(obeyed, position_rad, velocity_rad_s, load, elapsed_s)
         # A joint must be beyond its limit for a while: single readings may be wrong.
         beyond = off > self._limit
         self._since_s = np.where(beyond & (self._count == 0), t_s, self._since_s)
@@ -148,43 +183,56 @@ class FollowingCheck:
         return np.maximum(np.maximum(low - position_rad, position_rad - high), 0.0)
 
     def _weakness(
-        self, law: np.ndarray, position_rad: np.ndarray, velocity_rad_s: np.ndarray, load: np.ndarray, elapsed_s: float
+        self,
+        laws: Sequence[np.ndarray],
+        position_rad: np.ndarray,
+        velocity_rad_s: np.ndarray,
+        load: np.ndarray,
+        elapsed_s: float,
     ) -> np.ndarray:
         """Return by how much the load of each motor is weaker than its law, on average [N m]."""
-        q, dq, kp, kd, tau = law.T
         most = np.asarray(self._following.most_nm, np.float64)
-        torque = np.clip(tau + kp * (q - position_rad) + kd * (dq - velocity_rad_s), -most, most)
+        q, dq, kp, kd, tau = np.moveaxis(np.array(laws), -1, 0)
+        torques = np.clip(tau + kp * (q - position_rad) + kd * (dq - velocity_rad_s), -most, most)
+        missing = np.abs(torques) - np.sign(torques) * load
         share = min(1.0, elapsed_s / self._following.response_s)
-        self._law = self._law + share * (torque - self._law)
-        self._weak = self._weak + share * (np.abs(torque) - np.sign(torque) * load - self._weak)
+        self._law = self._law + share * (torques[-1] - self._law)
+        self._weak = self._weak + share * (missing.min(axis=0) - self._weak)
         return np.maximum(self._weak, 0.0)
 
     def _missing_push(
         self,
-        times_s: np.ndarray,
-        commands: np.ndarray,
+        commands: Sequence[_Sent],
         position_rad: np.ndarray,
         velocity_rad_s: np.ndarray,
         elapsed_s: float,
+        unsure_s: float,
     ) -> np.ndarray:
         """Return which share of the acceleration by its commands each joint lacks."""
         push, before, self._velocity = self._following.push, self._velocity, velocity_rad_s
-        if push is None or before is None or not elapsed_s > 0.0:
-            return np.zeros(len(position_rad))
-        # The change of speed since the last measurement, and the commands that acted meanwhile, on average.
-        ends_s = self._t_s - self._following.delay_s - elapsed_s * np.linspace(1.0, 0.0, _PARTS, endpoint=False)
-        acted = commands[np.maximum(np.searchsorted(times_s, ends_s, "right") - 1, 0)].mean(axis=0)
-        speed = 0.5 * (velocity_rad_s + before)
-        free, pushed, friction = push(position_rad - 0.5 * elapsed_s * speed, speed, acted)
-        # A joint that is slow may be held by its friction, unless it is pushed much harder.
-        moves = (np.abs(speed) > _SLOW_RAD_S) | (np.abs(free + pushed) > 3.0 * friction)
-        by_command = np.where(moves, elapsed_s * pushed, 0.0)
-        answer = velocity_rad_s - before - elapsed_s * free
-        self._moved.append((self._t_s, by_command**2, by_command * answer))
-        while self._moved[0][0] < self._t_s - self._following.response_s:
+        unsure_s, self._unsure_s = max(unsure_s, self._unsure_s), unsure_s
+        if push is not None and before is not None and 0.0 < elapsed_s <= _LONGEST_S:
+            # The commands that acted since the last measurement, on average; unless their times are uncertain.
+            ends_s = self._t_s - self._following.delay_s - elapsed_s * np.linspace(1.0, 0.0, _PARTS, endpoint=False)
+            begins_s = np.array([sent.begin_s for sent in commands])
+            places = np.maximum(np.searchsorted(begins_s, ends_s, "right") - 1, 0)
+            for i in np.unique(places).tolist():
+                sent = commands[i]
+                if sent.end_s > ends_s[0]:
+                    unsure_s = max(unsure_s, min(sent.end_s, self._t_s) - sent.begin_s)
+            if unsure_s <= _UNSURE * elapsed_s:
+                acted = np.array([commands[i].command for i in places]).mean(axis=0)
+                speed = 0.5 * (velocity_rad_s + before)
+                free, pushed, friction = push(position_rad - 0.5 * elapsed_s * speed, speed, acted)
+                # A joint that is slow may be held by its friction, unless it is pushed much harder.
+                moves = (np.abs(speed) > _SLOW_RAD_S) | (np.abs(free + pushed) > 3.0 * friction)
+                by_command = np.where(moves, elapsed_s * pushed, 0.0)
+                answer = velocity_rad_s - before - elapsed_s * free
+                self._moved.append((self._t_s, by_command**2, by_command * answer))
+        while self._moved and self._moved[0][0] < self._t_s - self._following.response_s:
             self._moved.pop(0)
-        squares = np.sum([squared for _, squared, _ in self._moved], axis=0)
-        products = np.sum([product for _, _, product in self._moved], axis=0)
+        squares = np.sum([np.zeros(len(position_rad)), *(squared for _, squared, _ in self._moved)], axis=0)
+        products = np.sum([np.zeros(len(position_rad)), *(product for _, _, product in self._moved)], axis=0)
         return np.where(squares > _ENOUGH, 1.0 - products / np.maximum(squares, _ENOUGH), 0.0)
 
     def _stop(self, joint: int, position_rad: np.ndarray, load: np.ndarray, off: np.ndarray) -> SafetyStop:

@@ -1,20 +1,34 @@
-"""The control process's side of the guardian: starts it, sends it signs of life, and reads its messages."""
+"""The guardian: a process that makes the motors safe when the process that controls them dies or is silent.
 
+    python -P -m sim2real.hardware.safety.guardian LINK_FD SILENCE_S MODULE:FUNCTION [ARGUMENT ...]
+
+``FUNCTION(*arguments)`` returns the `Motors`. The process runs before torque goes on, has all that it needs open, and
+touches the motors only when the control process no longer does. `Guard` is that side, `Guardian` the control process's.
+"""
+
+import importlib
 import math
+import os
 import select
+import signal
 import socket
 import subprocess
 import sys
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Final, Protocol
 
 from sim2real.errors import HardwareLost, SafetyStop
 from sim2real.hardware.clock import SYSTEM_CLOCK, Clock
-from sim2real.hardware.safety import guardian_process as process
 
+READY, BEAT, REST, LEAVE, TRIP = b"r", b"+", b"-", b"q", b"!"
+TRIPPED, SAFE, FAILED = b"t", b"s", b"f"
+GIVE_UP_S = 10.0
+"""Longest time for which motors that do not confirm are asked again [s]."""
+PRIORITY: Final = 3  # above the threads that it watches, which have 1: should one never rest, this must not wait for it
+_PR_SET_PDEATHSIG: Final = 1  # of <sys/prctl.h>
 _START_TIMEOUT_S: Final = 10.0
 _SETTLE_TIMEOUT_S: Final = 1.0
 _KILL_S: Final = 0.01
@@ -23,13 +37,137 @@ _INTERVAL_S: Final = 0.01  # between signs of life if silence is not limited
 _DEAD: Final = "the guardian has died: the torque would stay on if this process died too"
 
 
-class Channel(Protocol):
-    """The control process's end of the connection to a guardian.
+@dataclass(frozen=True)
+class Motors:
+    """Motors that a guardian watches.
 
     Attributes:
-        pid: The guardian's process id.
-        clock: The time of the device.
+        take_torque_off: Makes them safe and takes their torque off; returns why they did not confirm it, else "".
+        cut: The advice to a person if they do not.
+        at_rest: Whether the death of the control process counts while the torque is off, too.
+        close: Called when the guardian ends.
     """
+
+    take_torque_off: Callable[[], str]
+    clock: Clock = SYSTEM_CLOCK
+    cut: str = "cut the motors' power"
+    at_rest: bool = True
+    close: Callable[[], None] = lambda: None
+
+
+class Guard:
+    """Decides when the motors are made safe; `watch` runs it in a process, `hear` and `look` are its steps.
+
+    Args:
+        silence_s: Longest time without a sign of life while torque is on [s]; 0: unlimited.
+        say: Sends a message to the control process.
+        tell: Tells a person.
+    """
+
+    def __init__(
+        self, motors: Motors, silence_s: float, say: Callable[[bytes], None], tell: Callable[[str], None]
+    ) -> None:
+        self._motors, self._silence_s, self._say, self._tell = motors, silence_s, say, tell
+        self._armed, self._tripped, self._heard_s = False, False, self._now_s()
+        say(READY)
+
+    def watch(self, link: int) -> None:
+        """Act until the control process ends it, or dies."""
+        while True:
+            due_s = self.due_s()
+            wait_s = None if due_s is None else max(0.0, due_s - self._now_s())
+            # Messages first: this process may be late itself.
+            if not select.select([link], [], [], wait_s)[0]:
+                self.look()
+            elif not self.hear(_received(link)):
+                return
+
+    def due_s(self) -> float | None:
+        """Return the time at which the control process has been silent for too long [s]; None: never."""
+        watched = self._armed and not self._tripped and self._silence_s > 0.0
+        return self._heard_s + self._silence_s if watched else None
+
+    def look(self) -> None:
+        """Make the motors safe if the control process has been silent for too long."""
+        due_s = self.due_s()
+        if due_s is not None and self._now_s() >= due_s:
+            # Stay until the control process leaves: it may resume, and switch torque on before it notices.
+            self._trip(f"the control process was silent for {self._silence_s:.2f} s")
+
+    def hear(self, messages: bytes) -> bool:
+        """Process messages of the control process; none: it has died. Return whether to go on."""
+        if messages.endswith(LEAVE):
+            return False
+        if TRIP in messages and not self._tripped:
+            self._trip("the control process stopped the robot")
+        elif not messages:
+            if self._armed or self._motors.at_rest:
+                self._make_safe("the control process is gone")
+            return False
+        else:
+            self._armed, self._heard_s = messages.endswith(BEAT), self._now_s()
+        return True
+
+    def _trip(self, reason: str) -> None:
+        self._tripped = True
+        self._say(TRIPPED)
+        self._say(SAFE if self._make_safe(reason) else FAILED)
+
+    def _make_safe(self, reason: str) -> bool:
+        """Make the motors safe, and report it; return whether all have confirmed."""
+        begin_s = self._now_s()
+        try:
+            failure = self._motors.take_torque_off()
+        except Exception as error:
+            failure = f"{type(error).__name__}: {error}"
+        result = f"torque is off, confirmed after {1e3 * (self._now_s() - begin_s):.0f} ms"
+        if failure:
+            result = f"torque off could NOT be confirmed, {failure}; {self._motors.cut}"
+        self._tell(f"sim2real guardian: {reason}: {result}")
+        return not failure
+
+    def _now_s(self) -> float:
+        return 1e-9 * self._motors.clock.now_ns()
+
+
+def _received(link: int) -> bytes:
+    """Return the control process' messages; empty if it has died."""
+    try:
+        return os.read(link, 4096)
+    except OSError:
+        return b""
+
+
+def _write(fd: int, message: bytes) -> None:
+    """Write to the control process or the terminal, if it still exists."""
+    with suppress(OSError):
+        os.write(fd, message)
+
+
+def main(link_fd: str, silence_s: str, place: str, *arguments: str) -> None:
+    """Run until the control process ends."""
+    module, _, name = place.partition(":")
+    motors: Motors = getattr(importlib.import_module(module), name)(*arguments)
+    # Ignore what a terminal and a service manager send; this ends when the control process does.
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    # On a busy machine this process, which is almost always idle, must not wait. Threads that a connection has begun
+    # keep their priority.
+    with suppress(AttributeError, OSError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+    # Should this process be stopped, as by a debugger, the kernel continues it when the control process dies (Linux).
+    with suppress(ImportError, OSError, AttributeError):
+        import ctypes
+
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGCONT)
+    link = int(link_fd)
+    tell = lambda text: _write(2, f"{text}\n".encode())  # noqa: E731
+    Guard(motors, float(silence_s), lambda message: _write(link, message), tell).watch(link)
+    motors.close()
+
+
+class Channel(Protocol):
+    """The control process's end of the connection to a guardian."""
 
     pid: int
     clock: Clock
@@ -51,8 +189,7 @@ class Process:
     """A guardian's process, which shares a socket with this one; a `Channel`.
 
     Args:
-        program: Arguments of Python that start the process: flags, then a file or a module. It gets the file descriptor
-            of the socket, and the longest silence, and then ``arguments``.
+        place: ``MODULE:FUNCTION`` that returns the `Motors`.
         longest_s: The longest silence [s].
         pass_fds: Further file descriptors that the process inherits.
 
@@ -60,12 +197,10 @@ class Process:
         HardwareLost: It cannot be started.
     """
 
-    def __init__(
-        self, program: Sequence[str], longest_s: float, arguments: Sequence[str] = (), pass_fds: Sequence[int] = ()
-    ) -> None:
+    def __init__(self, place: str, arguments: Sequence[str], longest_s: float, pass_fds: Sequence[int] = ()) -> None:
         self.clock: Clock = SYSTEM_CLOCK
         self._link, other = socket.socketpair()
-        command = [sys.executable, *program, str(other.fileno()), repr(longest_s), *arguments]
+        command = [sys.executable, "-P", "-m", __name__, str(other.fileno()), repr(longest_s), place, *arguments]
         try:
             # In a new session, so that Ctrl-C in a terminal reaches only the control process.
             self._process = subprocess.Popen(
@@ -111,14 +246,13 @@ class Process:
 
 
 class Guardian:
-    """A separate process that makes the motors safe when this one dies, or gives no sign of life while torque is on.
+    """The control process's side: starts a guardian, sends it signs of life, and reads its messages.
 
-    In normal operation it only receives signs of life from `beat`, which cost 10 us each: a guardian that died is
-    noticed at the next one. If this process dies while the guardian is stopped, as by a debugger, the kernel lets it
-    continue (Linux), and it makes the motors safe. It reports its actions on stderr.
+    In normal operation a guardian only receives signs of life from `beat`, which cost 10 us each: one that died is
+    noticed at the next one. It reports its actions on stderr.
 
     Args:
-        start: Starts the guardian, given the longest silence [s].
+        start: Starts it, given the longest silence [s].
         silence_s: Longest time without a sign of life while torque is on [s]; 0: unlimited, only this process' death
             counts.
         settle_s: Longest time until the motors are in the safe state [s].
@@ -130,17 +264,15 @@ class Guardian:
     def __init__(
         self, start: Callable[[float], Channel], silence_s: float, settle_s: float = _SETTLE_TIMEOUT_S
     ) -> None:
-        self._settle_s = settle_s
-        self._silence_s = silence_s
+        self._silence_s, self._settle_s = silence_s, settle_s
         self._interval_s = silence_s / _BEATS or _INTERVAL_S
         self._beat_s = -math.inf
         self._armed = self._tripped = False
         self._lock = threading.RLock()  # reentrant, as a signal handler may close the bus in the middle of `beat`
         self._messages = b""
-        # Signs of life are one interval apart.
+        # Signs of life are one interval apart. Torque may go on only once it watches.
         self._channel = start(silence_s + self._interval_s if silence_s else 0.0)
-        # Torque may go on only once it watches.
-        if not self._hears(process.READY, _START_TIMEOUT_S):
+        if not self._hears(READY, _START_TIMEOUT_S):
             self._channel.close(_KILL_S)
             raise HardwareLost("the guardian does not start", hint="torque stays off without it")
         self._messages = b""
@@ -156,11 +288,7 @@ class Guardian:
         return bool(self._messages) or self._tripped
 
     def arm(self) -> None:
-        """Arm the guardian; called before torque goes on.
-
-        Raises:
-            SafetyStop: As in `beat`.
-        """
+        """Arm the guardian before torque goes on; raise SafetyStop as `beat` does."""
         with self._lock:
             self._armed, self._beat_s = True, -math.inf
         try:
@@ -173,7 +301,7 @@ class Guardian:
         """Let it no longer watch for silence, as torque is off. Never raises; if it has died, the next `arm` raises."""
         with self._lock, suppress(SafetyStop):  # locked, as a sign of life sent after this message would arm it again
             self._armed = False
-            self._send(process.REST)
+            self._send(REST)
 
     def beat(self) -> None:
         """Send a sign of life if one is due; called before every instruction on the bus.
@@ -182,14 +310,14 @@ class Guardian:
             SafetyStop: The guardian has taken the torque off, or has died; also at all later calls.
         """
         with self._lock:
-            now_s = self._now_s()
+            now_s = 1e-9 * self._channel.clock.now_ns()
             if not self._armed or (not self._messages and now_s - self._beat_s < self._interval_s):
                 return
             self._beat_s = now_s
             # Any message means that it has taken over; without one, show it that this process lives.
             self._listen()
             if not self._messages:
-                self._send(process.BEAT)
+                self._send(BEAT)
                 return
         raise SafetyStop(
             f"the guardian has taken the torque off: this process was silent for {self._silence_s:g} s",
@@ -208,7 +336,7 @@ class Guardian:
         """Let it make the motors safe now. Without a lock, for signal handlers; never raises."""
         self._tripped = True
         with suppress(OSError):  # it has died, or does not read
-            self._channel.send(process.TRIP)
+            self._channel.send(TRIP)
 
     def settle(self) -> bool:
         """Wait until the motors are in the safe state, if it is making them safe. Never raises.
@@ -221,23 +349,20 @@ class Guardian:
                 self._listen()
         except SafetyStop:
             return False
-        if self.took_over and process.SAFE not in self._messages:
-            self._hears(process.SAFE, self._settle_s)
+        if self.took_over and SAFE not in self._messages:
+            self._hears(SAFE, self._settle_s)
         return not self.took_over
 
     def end(self, confirmed: bool) -> None:
         """End the guardian. Never raises.
 
         Args:
-            confirmed: Whether all servos have confirmed that their torque is off; if not, it tries for another 10 s.
+            confirmed: Whether all motors have confirmed that their torque is off; if not, it tries for another 10 s.
         """
         if confirmed:
             with suppress(SafetyStop):
-                self._send(process.LEAVE)
+                self._send(LEAVE)
         self._channel.close(_SETTLE_TIMEOUT_S if confirmed else 0.0)
-
-    def _now_s(self) -> float:
-        return 1e-9 * self._channel.clock.now_ns()
 
     def _send(self, message: bytes) -> None:
         try:
@@ -246,11 +371,7 @@ class Guardian:
             raise SafetyStop(_DEAD, hint="start again") from error
 
     def _listen(self, until_ns: int = 0) -> bool:
-        """Read the guardian's messages, waiting until a time [ns]; return whether there were any.
-
-        Raises:
-            SafetyStop: It has died.
-        """
+        """Read the guardian's messages, waiting until a time [ns]; return whether there were any; raise if it died."""
         heard = False
         while (received := self._channel.receive(0 if heard else until_ns)) is not None:
             if not received:
@@ -263,34 +384,11 @@ class Guardian:
         """Wait for a message; return False after the timeout, a report of failure, or the guardian's death."""
         end_ns = self._channel.clock.now_ns() + round(1e9 * timeout_s)
         with suppress(SafetyStop):
-            while message not in self._messages and process.FAILED not in self._messages:
+            while message not in self._messages and FAILED not in self._messages:
                 if not self._listen(end_ns):
                     break
         return message in self._messages
 
 
-class BusGuardian(Guardian):
-    """A guardian of servos on a bus: it takes their torque off.
-
-    It shares the open port and its lock, so that no other process gets the port before the torque is off.
-
-    Args:
-        off: The packet that takes the torque of all servos off.
-        servos: For each servo, the packet that reads its torque register, and the answers that mean "off".
-        silence_s: As in ``Guardian`` [s].
-        answer_s: Longest wait for a servo's answer [s].
-    """
-
-    def __init__(
-        self,
-        port_fd: int,
-        off: bytes,
-        servos: Sequence[tuple[bytes, Sequence[bytes]]],
-        silence_s: float,
-        answer_s: float,
-    ) -> None:
-        # -I -S: neither the user's site packages nor the working directory may affect what runs there.
-        program = ["-I", "-S", str(Path(process.__file__))]
-        packets = [f"{query.hex()}:{','.join(a.hex() for a in answers)}" for query, answers in servos]
-        arguments = [str(port_fd), repr(answer_s), off.hex(), *packets]
-        super().__init__(lambda longest_s: Process(program, longest_s, arguments, (port_fd,)), silence_s)
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -226,7 +226,8 @@ class Rig:
         self._speed_rad_s, self._sampled_s = reading.velocity_rad_s, sampled_s
         self._position_rad = reading.position_rad
         if self._follow_check is not None and self._on:
-            self._follow_check.check(reading.position_rad, reading.velocity_rad_s, reading.load, sampled_s)
+            late_s = 1e-9 * transaction.late_ns
+            self._follow_check.check(reading.position_rad, reading.velocity_rad_s, reading.load, sampled_s, late_s)
         return reading
 
     def follow(self, following: Following) -> None:
@@ -256,13 +257,11 @@ class Rig:
                 raise SafetyStop("no command is sent: the torque is off", hint="start the rig first")
             self._require_near(np.asarray(command, np.float64))
             allowed = self.gate.apply(self._softened(command), age_s, now_s, self._speed_rad_s)
-            if self._follow_check is not None:
-                self._follow_check.sent(allowed, self._now_s())
             if self.torque_withheld:
                 self.commanding.add(self.device.measure().transaction)
+                self._sent = allowed
             else:
-                self.commanding.add(self.device.command(self._mounting.to_motors(allowed)))
-            self._sent = allowed
+                self.commanding.add(self._send(allowed))
             self._commanded_s = self._now_s()
         return allowed
 
@@ -454,14 +453,21 @@ class Rig:
         waiting = self._commanded_s is None
         late = not waiting and self._now_s() - (self._commanded_s or 0.0) > self.gate.config.command_timeout_s
         if waiting or late:
-            fallback = self.gate.fallback
-            self.device.command(self._mounting.to_motors(fallback))
-            self._sent = fallback
-            if self._follow_check is not None:
-                self._follow_check.sent(fallback, self._now_s())
+            self._send(self.gate.fallback)
         if late:
             self.timeouts += 1
             self._commanded_s = self._now_s()
+
+    def _send(self, command: np.ndarray) -> Transaction:
+        """Send a command of the joints."""
+        check = self._follow_check
+        if check is not None:
+            check.sending(command, self._now_s())
+        transaction = self.device.command(self._mounting.to_motors(command))
+        if check is not None:
+            check.sent(self._now_s())
+        self._sent = command
+        return transaction
 
     def _now_s(self) -> float:
         return 1e-9 * self.clock.now_ns()

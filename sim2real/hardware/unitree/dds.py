@@ -89,30 +89,8 @@ class Address:
         )
 
 
-class _Domains:
-    """The open domains of this process: Cyclone DDS has one configuration for each, so connections share it."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._open: dict[int, tuple[Address, Domain, int]] = {}
-
-    def use(self, address: Address) -> None:
-        with self._lock:
-            other, domain, users = self._open.get(address.domain, (address, None, 0))
-            if other != address:
-                raise UsageError(f"domain {address.domain} is open in this process already, as {other}")
-            if domain is None:
-                domain = Domain(address.domain, address.config)
-            self._open[address.domain] = address, domain, users + 1
-
-    def leave(self, address: Address) -> None:
-        with self._lock:
-            other, domain, users = self._open.pop(address.domain)
-            if users > 1:
-                self._open[address.domain] = other, domain, users - 1
-
-
-_DOMAINS: Final = _Domains()
+_DOMAINS: Final[dict[int, tuple[Address, Domain]]] = {}
+"""The domains that this process has opened: Cyclone DDS has one configuration for each, so connections share it."""
 
 
 class DdsLink:
@@ -131,17 +109,19 @@ class DdsLink:
         self._reading = threading.Lock()
         self._writers: dict[object, str] = {}
         self._entities: _Entities | None = None
-        # Open the domain, or share the one that is open.
+        other = _DOMAINS.get(address.domain, (address,))[0]
+        if other != address:
+            raise UsageError(f"domain {address.domain} is open in this process already, as {other}")
         try:
-            _DOMAINS.use(address)
-        except DDSException as error:
-            raise self._lost("cannot be opened", error) from error
-        # Make the writer and the readers; without them the domain closes again.
-        try:
+            if address.domain not in _DOMAINS:
+                _DOMAINS[address.domain] = address, Domain(address.domain, address.config)
             self._entities = _Entities(address.domain, self._mark)
         except DDSException as error:
-            _DOMAINS.leave(address)
             raise self._lost("cannot be opened", error) from error
+
+    def now_s(self) -> float:
+        """Return the time [s]."""
+        return 1e-9 * self.clock.now_ns()
 
     def write(self, command: LowCmd) -> None:
         """Publish a command, without waiting and without a lock; HardwareLost if the connection is closed."""
@@ -189,17 +169,15 @@ class DdsLink:
         return list(self._writers.values())
 
     def guardian(self, drive: LegDrive, silence_s: float, settle_s: float) -> Guardian:
-        """Return a guardian in a process of its own, with a writer of its own; arguments as in `Guardian`."""
-        program = ("-P", "-m", "sim2real.hardware.unitree.guardian_process")
+        """Start a guardian in a process of its own, with a writer of its own; arguments as in `Guardian`."""
         arguments = [str(self.address), self._mark.decode(), repr(drive.damping), repr(drive.lie_s)]
-        return Guardian(lambda longest_s: Process(program, longest_s, arguments), silence_s, settle_s)
+        place = "sim2real.hardware.unitree.device:guarded"
+        return Guardian(lambda longest_s: Process(place, arguments, longest_s), silence_s, settle_s)
 
     def close(self) -> None:
-        """Leave the domain. May be called twice."""
+        """Close the connection. May be called twice."""
         with self._reading:
-            if self._entities is not None:
-                self._entities = None  # CPython deletes them now, or when a thread's write has ended
-                _DOMAINS.leave(self.address)
+            self._entities = None  # CPython deletes them now, or when a thread's write has ended
 
     def _closed(self) -> HardwareLost:
         return HardwareLost(f"the robot on {self.address} is not open", hint="call open first")
@@ -211,9 +189,9 @@ class DdsLink:
 
 
 class StateStream:
-    """Reads states in their order, and counts those that are missing, damaged, late or overtaken.
+    """Reads states in their order; drops those with a wrong CRC, and counts missing, late and overtaken ones.
 
-    A state that is damaged has a wrong CRC; it is dropped. Missing and damaged ones show as a gap in the ticks.
+    Missing and damaged ones show as a gap in the ticks.
 
     Args:
         max_silence_s: Time without a state after which the robot is lost [s].
@@ -232,9 +210,9 @@ class StateStream:
     def begin(self, timeout_s: float) -> LowState:
         """Wait for the first states, learn by how much the tick grows, and return the newest state."""
         with self._lock:
-            states, damaged, end_s = [], 0, self._now_s() + timeout_s
+            states, damaged, end_s = [], 0, self._robot.now_s() + timeout_s
             while len(states) < _LEARNT:
-                left_s = end_s - self._now_s()
+                left_s = end_s - self._robot.now_s()
                 state = self._robot.next_state(left_s) if left_s > 0.0 else None
                 if state is None:
                     raise self._silent(timeout_s, damaged)
@@ -242,7 +220,7 @@ class StateStream:
                 damaged += not state.intact
             ticks = np.array([state.record["tick"] for state in states], np.int64)
             self._step = max(1, round(float(np.median(np.diff(ticks)))))
-            self._tick, self._taken_s = int(ticks[-1]), self._now_s()
+            self._tick, self._taken_s = int(ticks[-1]), self._robot.now_s()
             return states[-1]
 
     def next(self) -> tuple[LowState, Transaction]:
@@ -253,9 +231,9 @@ class StateStream:
             begin_ns = self._clock.now_ns()
             while (old := self._robot.next_state(0.0)) is not None:
                 self._is_next(old)
-            lost, damaged, end_s = self._lost, 0, self._now_s() + self._max_silence_s
+            lost, damaged, end_s = self._lost, 0, self._robot.now_s() + self._max_silence_s
             while True:
-                left_s = end_s - self._now_s()
+                left_s = end_s - self._robot.now_s()
                 state = self._robot.next_state(left_s) if left_s > 0.0 else None
                 if state is None:
                     raise self._silent(self._max_silence_s, damaged)
@@ -282,7 +260,7 @@ class StateStream:
         """Note a state; return whether it is intact and newer than the one before."""
         if not state.intact:
             return False
-        tick, now_s = int(state.record["tick"]), self._now_s()
+        tick, now_s = int(state.record["tick"]), self._robot.now_s()
         # The counter of 32 bits starts again at 0.
         ahead = (tick - (self._tick or 0) + 2**31) % 2**32 - 2**31
         if ahead <= 0:
@@ -293,9 +271,6 @@ class StateStream:
             self._lost += max(0, round(ahead / self._step) - 1)
         self._tick, self._taken_s = tick, now_s
         return True
-
-    def _now_s(self) -> float:
-        return 1e-9 * self._clock.now_ns()
 
     def _silent(self, time_s: float, damaged: int) -> HardwareLost:
         if damaged:
@@ -310,7 +285,7 @@ class StateStream:
 
 
 EMULATED: Final[dict[Address, Callable[[str], DdsLink]]] = {}
-"""Address -> connects, with a mark, to an emulated robot in this process: `unitree.virtual`."""
+"""Address -> connects, with a mark, to an emulated robot in this process: `emulation.virtual`."""
 
 
 def connect(address: Address, mark: str) -> DdsLink:

@@ -4,6 +4,7 @@ import atexit
 import logging
 import math
 import os
+import sys
 import threading
 import uuid
 from collections.abc import Mapping, Sequence
@@ -27,12 +28,12 @@ from sim2real.hardware.device import (
     Transaction,
     WithoutHost,
 )
+from sim2real.hardware.safety import guardian as guardians
 from sim2real.hardware.safety.following import Following
-from sim2real.hardware.safety.guardian import Guardian
+from sim2real.hardware.safety.guardian import Guardian, Motors
 from sim2real.hardware.unitree.dds import LEASE_S, Address, DdsLink, StateStream, connect
-from sim2real.hardware.unitree.legs import NAMES, TORQUE_NM, LegDrive, command
+from sim2real.hardware.unitree.legs import NAMES, TORQUE_NM, LegDrive, command, motors_on, sit_down
 from sim2real.hardware.unitree.messages import COMMAND_TOPIC, MOTORS, LowCmd, LowState
-from sim2real.hardware.unitree.sit_down import motors_on, sit_down
 
 PARTS: Final[Mapping[str, ReadingPart]] = MappingProxyType(
     {
@@ -54,6 +55,7 @@ _SOURCE: Final = (
     "not measured by us"
 )
 _LOGGER = logging.getLogger(__name__)
+_FIRST_STATE_S: Final = 5.0
 _OPEN_S: Final = 3.0
 _DISCOVERY_S: Final = 1.0
 """Time in which DDS finds the writers of a robot's domain [s]."""
@@ -434,6 +436,26 @@ def _require_alone(robot: DdsLink, kind: type[HardwareLost] | type[SafetyStop]) 
             f"another program publishes {COMMAND_TOPIC}: {', '.join(others)}. The motors would follow both",
             hint="end that program, or switch the robot's motion service off: in the app, or with MotionSwitcher",
         )
+
+
+def motors_of(robot: DdsLink, drive: LegDrive) -> Motors:
+    """Return the legs as a guardian watches them; after their torque was off, another program may have the robot."""
+
+    def take_torque_off() -> str:
+        try:
+            return sit_down(robot, drive, guardians.GIVE_UP_S)
+        except HardwareLost as error:
+            return str(error)
+
+    return Motors(take_torque_off, robot.clock, "switch the robot off", at_rest=False, close=robot.close)
+
+
+def guarded(address: str, mark: str, damping: str, lie_s: str) -> Motors:
+    """Return the legs that a guardian's process watches, once their states come."""
+    robot = DdsLink(Address.parse(address), mark)
+    if robot.next_state(_FIRST_STATE_S) is None:
+        sys.exit(f"sim2real guardian: the robot on {address} sends no state")
+    return motors_of(robot, LegDrive(damping=float(damping), lie_s=float(lie_s), kd_max=float(damping)))
 
 
 def legs(port: str, ids: Sequence[int], drive: Any, *, baud_rate: int, silence_s: float) -> UnitreeLegs:

@@ -9,8 +9,7 @@ A message is a record in the layout of Unitree's C struct, `message.record`. Its
 
 import zlib
 from dataclasses import dataclass
-from inspect import get_annotations
-from typing import Any, ClassVar, Final, Self, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Self
 
 import numpy as np
 
@@ -19,8 +18,7 @@ from sim2real.installation import with_extra
 
 try:
     from cyclonedds import idl
-    from cyclonedds.idl import annotations
-    from cyclonedds.idl.types import array, float32, int16, int32, uint8, uint16, uint32
+    from cyclonedds.idl import annotations, types
 except ImportError as error:
     raise UsageError("Unitree's robots need cyclonedds, which is not installed", hint=with_extra("unitree")) from error
 
@@ -39,6 +37,32 @@ NO_POSITION: Final = 2.146e9
 NO_VELOCITY: Final = 16000.0
 """`dq` of a motor without a velocity controller (Unitree's VelStopF)."""
 
+# Unitree's package unitree_go, type by type, each field with its type and its number: robots and other programs match
+# the types by names and structure. Rates are in rad/s, accelerations in m/s^2, quaternions (w, x, y, z), currents in
+# mA, states of charge in %; `tick` counts milliseconds.
+_FIELDS: Final = {
+    "MotorCmd": "mode u1, q f4, dq f4, tau f4, kp f4, kd f4, reserve u4*3",
+    "BmsCmd": "off u1, reserve u1*3",
+    "LowCmd": "head u1*2, level_flag u1, frame_reserve u1, sn u4*2, version u4*2, bandwidth u2, motor_cmd MotorCmd*20, "
+    "bms_cmd BmsCmd, wireless_remote u1*40, led u1*12, fan u1*2, gpio u1, reserve u4, crc u4",
+    "IMUState": "quaternion f4*4, gyroscope f4*3, accelerometer f4*3, rpy f4*3, temperature u1",
+    "MotorState": "mode u1, q f4, dq f4, ddq f4, tau_est f4, q_raw f4, dq_raw f4, ddq_raw f4, temperature u1, lost u4, "
+    "reserve u4*2",
+    "BmsState": "version_high u1, version_low u1, status u1, soc u1, current i4, cycle u2, bq_ntc u1*2, mcu_ntc u1*2, "
+    "cell_vol u2*15",
+    "LowState": "head u1*2, level_flag u1, frame_reserve u1, sn u4*2, version u4*2, bandwidth u2, imu_state IMUState, "
+    "motor_state MotorState*20, bms_state BmsState, foot_force i2*4, foot_force_est i2*4, tick u4, "
+    "wireless_remote u1*40, bit_flag u1, adc_reel f4, temperature_ntc1 u1, temperature_ntc2 u1, power_v f4, "
+    "power_a f4, fan_frequency u2*4, reserve u4, crc u4",
+}
+_NUMBERS: Final[dict[str, Any]] = {
+    "u1": types.uint8,
+    "i2": types.int16,
+    "u2": types.uint16,
+    "i4": types.int32,
+    "u4": types.uint32,
+    "f4": types.float32,
+}
 _LITTLE_ENDIAN: Final = b"\x00\x01\x00\x00"  # XCDR1
 _REVERSED: Final = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 
@@ -52,6 +76,35 @@ def crc32(record: np.ndarray) -> int:
     big_endian = np.frombuffer(record.tobytes(), "<u4")[:-1].byteswap().tobytes()
     reflected = zlib.crc32(big_endian.translate(_REVERSED)) ^ 0xFFFFFFFF
     return int.from_bytes(reflected.to_bytes(4, "little").translate(_REVERSED), "big")
+
+
+def _fields(name: str) -> list[tuple[str, str, int]]:
+    """Return the fields of a type: name, type, and number of values; 0: it is no array."""
+    rows = [text.split() for text in _FIELDS[name].split(", ")]
+    return [(field, kind.partition("*")[0], int(kind.partition("*")[2] or 0)) for field, kind in rows]
+
+
+def _layout(name: str) -> np.dtype:
+    """Return the layout of a type in C."""
+    if name in _NUMBERS:
+        return np.dtype(f"<{name}")
+    rows = [(field, _layout(kind), (count,) if count else ()) for field, kind, count in _fields(name)]
+    return np.dtype(rows, align=True)
+
+
+def _content(layout: np.dtype) -> np.ndarray:
+    """Return a byte for each byte of a layout: 255, or 0 for padding."""
+    if layout.subdtype is not None:
+        element, (length,) = layout.subdtype
+        return np.tile(_content(element), length)
+    content = np.full(layout.itemsize, 0 if layout.fields else 255, np.uint8)
+    for inner, offset, *_ in (layout.fields or {}).values():
+        content[offset : offset + inner.itemsize] = _content(inner)
+    return content
+
+
+def _aligned(offset: int) -> int:
+    return (offset + 3) & ~3
 
 
 class _Record:
@@ -95,171 +148,40 @@ class _Record:
         return cls((np.frombuffer(raw, np.uint8) & cls._content).view(cls.layout).reshape(()))
 
 
-def _aligned(offset: int) -> int:
-    return (offset + 3) & ~3
+def _type(name: str, *bases: type) -> Any:
+    """Return the class of a type for `cyclonedds`, to which the first base is the parent of the type in the IDL."""
+    hints = {}
+    for field, kind, count in _fields(name):
+        element = _NUMBERS.get(kind) or _type(kind)
+        hints[field] = types.array[element, count] if count else element
+    meta, all_bases = type(idl.IdlStruct), (idl.IdlStruct, *bases)
+    space = meta.__prepare__(name, all_bases, typename=f"unitree_go.msg.dds_.{name}_")
+    space["__annotations__"].update(hints)
+    made = annotations.final(annotations.autoid("sequential")(meta(name, all_bases, space)))
+    return made if bases else dataclass(made)
 
 
-def _layout(declared: object) -> np.dtype:
-    """Return the layout in C of a type of the messages."""
-    if isinstance(declared, type):  # of the class alone: not the fields of `_Record`
-        fields = get_annotations(declared)
-        return np.dtype([(name, _layout(hint)) for name, hint in fields.items()], align=True)
-    kind = get_args(declared)[1]
-    return np.dtype(kind) if isinstance(kind, str) else np.dtype((_layout(kind.subtype), (kind.length,)))
-
-
-def _content(layout: np.dtype) -> np.ndarray:
-    """Return a byte for each byte of a layout: 255, or 0 for padding."""
-    if layout.subdtype is not None:
-        element, (length,) = layout.subdtype
-        return np.tile(_content(element), length)
-    content = np.full(layout.itemsize, 0 if layout.fields else 255, np.uint8)
-    for inner, offset, *_ in (layout.fields or {}).values():
-        content[offset : offset + inner.itemsize] = _content(inner)
-    return content
-
-
-# The types below are Unitree's unitree_go package; robots and other programs match them by names and structure.
-
-
-@dataclass
-@annotations.final
-@annotations.autoid("sequential")
-class MotorCmd(idl.IdlStruct, typename="unitree_go.msg.dds_.MotorCmd_"):
-    """The command of one motor."""
-
-    mode: uint8
-    q: float32
-    dq: float32
-    tau: float32
-    kp: float32
-    kd: float32
-    reserve: array[uint32, 3]
-
-
-@dataclass
-@annotations.final
-@annotations.autoid("sequential")
-class BmsCmd(idl.IdlStruct, typename="unitree_go.msg.dds_.BmsCmd_"):
-    """The command of the battery."""
-
-    off: uint8
-    reserve: array[uint8, 3]
-
-
-@annotations.final
-@annotations.autoid("sequential")
-class LowCmd(idl.IdlStruct, _Record, typename="unitree_go.msg.dds_.LowCmd_"):
-    """A command of all motors; its torque is ``tau + kp (q - measured q) + kd (dq - measured dq)`` in the motor."""
-
-    head: array[uint8, 2]
-    level_flag: uint8
-    frame_reserve: uint8
-    sn: array[uint32, 2]
-    version: array[uint32, 2]
-    bandwidth: uint16
-    motor_cmd: array[MotorCmd, 20]
-    bms_cmd: BmsCmd
-    wireless_remote: array[uint8, 40]
-    led: array[uint8, 12]
-    fan: array[uint8, 2]
-    gpio: uint8
-    reserve: uint32
-    crc: uint32
-
-
-@dataclass
-@annotations.final
-@annotations.autoid("sequential")
-class IMUState(idl.IdlStruct, typename="unitree_go.msg.dds_.IMUState_"):
-    """The inertial measurement unit: quaternion (w, x, y, z), rates [rad/s], acceleration [m/s^2]."""
-
-    quaternion: array[float32, 4]
-    gyroscope: array[float32, 3]
-    accelerometer: array[float32, 3]
-    rpy: array[float32, 3]
-    temperature: uint8
-
-
-@dataclass
-@annotations.final
-@annotations.autoid("sequential")
-class MotorState(idl.IdlStruct, typename="unitree_go.msg.dds_.MotorState_"):
-    """The state of one motor: `q` [rad], `dq` [rad/s], `tau_est` [N m]."""
-
-    mode: uint8
-    q: float32
-    dq: float32
-    ddq: float32
-    tau_est: float32
-    q_raw: float32
-    dq_raw: float32
-    ddq_raw: float32
-    temperature: uint8
-    lost: uint32
-    reserve: array[uint32, 2]
-
-
-@dataclass
-@annotations.final
-@annotations.autoid("sequential")
-class BmsState(idl.IdlStruct, typename="unitree_go.msg.dds_.BmsState_"):
-    """The battery: state of charge [%], current [mA]."""
-
-    version_high: uint8
-    version_low: uint8
-    status: uint8
-    soc: uint8
-    current: int32
-    cycle: uint16
-    bq_ntc: array[uint8, 2]
-    mcu_ntc: array[uint8, 2]
-    cell_vol: array[uint16, 15]
-
-
-@annotations.final
-@annotations.autoid("sequential")
-class LowState(idl.IdlStruct, _Record, typename="unitree_go.msg.dds_.LowState_"):
-    """The state of all motors, the inertial measurement unit, the feet and the battery; `tick` counts milliseconds."""
-
-    head: array[uint8, 2]
-    level_flag: uint8
-    frame_reserve: uint8
-    sn: array[uint32, 2]
-    version: array[uint32, 2]
-    bandwidth: uint16
-    imu_state: IMUState
-    motor_state: array[MotorState, 20]
-    bms_state: BmsState
-    foot_force: array[int16, 4]
-    foot_force_est: array[int16, 4]
-    tick: uint32
-    wireless_remote: array[uint8, 40]
-    bit_flag: uint8
-    adc_reel: float32
-    temperature_ntc1: uint8
-    temperature_ntc2: uint8
-    power_v: float32
-    power_a: float32
-    fan_frequency: array[uint16, 4]
-    reserve: uint32
-    crc: uint32
-
-
-def _complete(message: Any, motors: str, padding: int) -> None:
-    """Set a message's layout, and let `cyclonedds` encode it as a record.
-
-    The methods are no part of `_Record`, as a class's first base counts as the parent of its type in the IDL.
-    """
-    message.layout = _layout(message)
-    fields: Any = message.layout.fields
-    message._cut = fields[motors][1] - padding
+def _message(name: str, motors: str, padding: int) -> Any:
+    """Return the class of a message, which `cyclonedds` encodes as a record."""
+    message = _type(name, _Record)
+    message.layout = _layout(name)
+    message._cut = message.layout.fields[motors][1] - padding
     message._content = _content(message.layout)
     message.serialize = lambda self, **_: self.to_wire()
     message.deserialize = lambda data, **_: message.from_wire(data)
     # A writer that leaves sends the fields of a key; these messages have none.
     message.deserialize_key = lambda *_, **__: message()
+    return message
 
 
-_complete(LowCmd, "motor_cmd", 2)
-_complete(LowState, "motor_state", 3)
+if TYPE_CHECKING:
+
+    class LowCmd(_Record):
+        """A command of all motors; its torque is ``tau + kp (q - measured q) + kd (dq - measured dq)`` in the motor."""
+
+    class LowState(_Record):
+        """The state of all motors, the inertial measurement unit, the feet and the battery."""
+
+else:
+    LowCmd = _message("LowCmd", "motor_cmd", 2)
+    LowState = _message("LowState", "motor_state", 3)
