@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from sim2real.hardware.bus.servos import ServoJoint
-from sim2real.hardware.hand_motion import Nudge
+from sim2real.hardware.calibration import Nudge
 
 from .robot import JOINTS, SERVOS, TRAVEL_RAD, SO101Robot, calibrations, read
 

@@ -11,7 +11,7 @@ from sim2real.artifacts.run import STAGES, attempts, run_folders, stage_status, 
 from sim2real.commands import flags
 from sim2real.commands.stages import DEMO_PIPELINE
 from sim2real.errors import Sim2RealError
-from sim2real.hardware import entries
+from sim2real.hardware import registry
 from sim2real.installation import has_jax
 from sim2real.runtime import compilation_cache
 from sim2real.stages.flag import Flag
@@ -54,8 +54,8 @@ def installation() -> str:
             summary = f"cannot be imported: {type(error).__name__}: {error}"
         rows.append([name, summary, _origin(source)])
     blocks = [pairs({**versions(), "compiled programs": _programs()}), table(rows, ["pipeline", "summary", "from"])]
-    for what, group in (("device", entries.DEVICES), ("world", entries.WORLDS)):
-        if plugins := entries.available(group):
+    for what, group in (("device", registry.DEVICES), ("world", registry.WORLDS)):
+        if plugins := registry.available(group):
             blocks.append(table([[name, _origin(plugins[name])] for name in sorted(plugins)], [what, "from"]))
     return "\n\n".join(blocks)
 

@@ -233,9 +233,8 @@ def calibrate(port: str, guide: Any, path: Path) -> None:
         HardwareLost: A servo or the motion contradicts the calibration. No motor has moved.
     """
     from sim2real.hardware.bus.port import BusConfig
-    from sim2real.hardware.calibration import find_servos, follow, write_calibration
+    from sim2real.hardware.calibration import HandMotion, find_servos, follow, write_calibration
     from sim2real.hardware.feetech import StsServos
-    from sim2real.hardware.hand_motion import HandMotion
     from sim2real.stages.terminal.console import note
 
     # Find the servos, and the file that belongs to them.

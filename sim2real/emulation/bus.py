@@ -1,33 +1,27 @@
-"""Servos on an emulated half-duplex bus, computed in planned time: settings and faults, the wire, and the instructions.
+"""Emulated motors on a half-duplex line, in planned time: settings and faults, the line, and the plant's clock.
 
-The times of all events are computed from the times at which the host's bytes arrive, and do not depend on how late the
-emulator's process runs: an instruction of n bytes that arrives at t is complete at max(t, wire free) + n * 10 / baud;
-the values that it reads are those of one sensing latency earlier, and its commands take effect one actuation latency
-later.
+An instruction of n bytes that arrives at t is complete at max(t, wire free) + n * 10 / baud; the values that it reads
+are those of one sensing latency earlier, and its commands take effect one actuation latency later.
 """
 
 from __future__ import annotations
 
 import heapq
 import random
-import time
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final, Generic, Protocol, TypeVar
+from typing import Any, ClassVar, Final, Protocol, TypeVar
 
-from sim2real.emulation.faults import Emulation, FaultTimes
-from sim2real.emulation.firmware import ServoFirmware
 from sim2real.emulation.plant import Plant, PlantClock
+from sim2real.emulation.robot import Emulation, PlannedRobot
 from sim2real.emulation.truth import Kind, TruthLog
-from sim2real.hardware.bus.packets import BROADCAST_ID, Instruction, Parser
-from sim2real.hardware.bus.registers import Family
 from sim2real.hardware.device import OperatingMode
 
 
 @dataclass(frozen=True)
 class BusEmulation(Emulation):
-    """Settings of an emulated bus and its servos; see `Emulation` for the others.
+    """Settings of an emulated bus and its motors; see `Emulation` for the others.
 
     Args:
         baud_rate: Bits per second; a byte takes 10 bits.
@@ -44,8 +38,8 @@ class BusEmulation(Emulation):
     """
 
     serve: ClassVar[str] = "sim2real.emulation.process:serve_bus"
-    bus_type: ClassVar[Callable[..., PlannedBus]]
-    """Makes the bus from plant, settings, truth, ``send`` and ``start_ns``."""
+    bus_type: ClassVar[Callable[..., PlannedBus[Any]]]
+    """Makes the bus from plant, settings, truth, ``send``, ``start_ns`` and ``now_ns``."""
 
     baud_rate: int = 1_000_000
     sensing_jitter_s: float = 0.0
@@ -71,10 +65,6 @@ class BusEmulation(Emulation):
             }
         )
 
-    def bus(self, plant: Plant, truth: TruthLog, send: Callable[[bytes], bool], start_ns: int) -> PlannedBus:
-        """Return the emulated bus with these settings; arguments as in `PlannedBus`."""
-        return type(self).bus_type(plant, self, truth, send, start_ns)
-
 
 _STALE_PACKET_NS: Final = 5_000_000  # after a longer pause, an incomplete packet is dropped
 
@@ -89,7 +79,7 @@ class Request:
     Attributes:
         t_ns: Time at which it was complete on the wire.
         t_host_ns: Time at which its last bytes had reached the emulator.
-        actuation_ns: Delay until its commands take effect, the same for all servos; None until it is drawn.
+        actuation_ns: Delay until its commands take effect, the same for all motors; None until it is drawn.
     """
 
     packet: Any
@@ -99,7 +89,7 @@ class Request:
 
 
 class Firmware(Protocol):
-    """Registers and firmware of one servo, as far as `PlannedBus` needs them; see `ServoFirmware` for the methods."""
+    """Registers and firmware of one motor, as far as `PlannedBus` needs them; `ServoFirmware` explains the methods."""
 
     servo_id: int
     heard_ns: int
@@ -125,22 +115,24 @@ class PacketParser(Protocol):
         ...
 
 
-class PlannedBus(FaultTimes, ABC):
-    """Emulated servos on a half-duplex bus, driving a plant; without port and threads.
+B = TypeVar("B", bound=BusEmulation)
 
-    Times are CLOCK_MONOTONIC nanoseconds. A subclass carries out instructions in `execute`, with the help of `measure`,
-    `actuate`, `configure` and `reply`.
+
+class PlannedBus(PlannedRobot[B]):
+    """Emulated motors on a half-duplex line, driving a plant.
+
+    A subclass carries out instructions in `execute`, with the help of `measure`, `actuate`, `configure` and `reply`.
 
     Args:
         send: Delivers the bytes of an answer to the host; returns False if the host cannot take them.
         start_ns: Time 0 of the plant.
-        servos: Id -> servo, ordered by id.
+        servos: Id -> firmware, ordered by id.
     """
 
     def __init__(
         self,
         plant: Plant,
-        config: BusEmulation,
+        config: B,
         truth: TruthLog,
         send: Callable[[bytes], bool],
         start_ns: int,
@@ -148,15 +140,12 @@ class PlannedBus(FaultTimes, ABC):
         parser: PacketParser,
         servos: Mapping[int, Firmware],
     ) -> None:
-        self._config = config
-        self._truth = truth
-        self._send = send
-        self._start_ns = start_ns
-        self._now_ns = now_ns
+        super().__init__(config, truth, start_ns)
+        self._send, self._now_ns = send, now_ns
         self.random = random.Random(config.seed)
         self._byte_ns = 1e10 / config.baud_rate
-        history_s = config.sensing_latency_s + config.sensing_jitter_s
         # The plant, with a history as long as the sensing latency.
+        history_s = config.sensing_latency_s + config.sensing_jitter_s
         self._clock = PlantClock(plant, round(config.plant_step_s * 1e9), start_ns, round(history_s * 1e9), truth)
         self._firmware = servos
         self._controllers: dict[int, tuple[int, int, float]] = {}
@@ -165,13 +154,10 @@ class PlannedBus(FaultTimes, ABC):
         self._last_effect_ns = dict.fromkeys(servos, 0)
         # The state of the wire: its bytes, faults and events.
         self._parser = parser
-        self._wire_free_ns = start_ns
-        self._last_bytes_ns = start_ns
-        self._delivered_ns = start_ns
+        self._wire_free_ns = self._last_bytes_ns = self._delivered_ns = start_ns
         self._frozen: dict[int, tuple[float, float, float]] = {}
         self._events: list[tuple[int, int, Callable[..., None], tuple[Any, ...]]] = []
         self._sequence = 0
-        FaultTimes.__init__(self, config, start_ns)
         if self.faulty_ns is not None:
             self.begin_faults(start_ns)
         if config.overload_after_s is not None:
@@ -181,7 +167,7 @@ class PlannedBus(FaultTimes, ABC):
     @property
     def baud_rate(self) -> int:
         """Bits per second on the wire."""
-        return self._config.baud_rate
+        return self.config.baud_rate
 
     @abstractmethod
     def execute(self, request: Request) -> None:
@@ -189,7 +175,7 @@ class PlannedBus(FaultTimes, ABC):
 
     def feed(self, chunk: bytes, now_ns: int) -> None:
         """Process bytes that the host has sent; `run_until(now_ns)` must be called next."""
-        if self._silent(now_ns):
+        if self.is_silent(now_ns):
             return
         # After a pause, the rest of an incomplete packet does not come any more.
         if now_ns - self._last_bytes_ns > _STALE_PACKET_NS:
@@ -208,14 +194,12 @@ class PlannedBus(FaultTimes, ABC):
                 servo.heard_ns += self._wire_free_ns - deadline_ns + 1
 
     def next_due_ns(self) -> int | None:
-        """Return the time of the next event; None if there is none."""
         due = [deadline for s in self._firmware.values() if (deadline := s.watchdog_deadline_ns()) is not None]
         if self._events:
             due.append(self._events[0][0])
         return min(due, default=None)
 
     def run_until(self, t_ns: int) -> None:
-        """Process all events up to `t_ns` in order, and advance the plant to that time."""
         while (due_ns := self.next_due_ns()) is not None and due_ns <= t_ns:
             self._clock.advance(due_ns)
             # Watchdogs first: an instruction that comes at the same time is too late.
@@ -229,15 +213,14 @@ class PlannedBus(FaultTimes, ABC):
         self._clock.advance(t_ns)
 
     def begin_faults(self, t_ns: int) -> None:
-        """Count the times of faults from ``t_ns``."""
-        self.faulty_ns = t_ns
-        if self._config.lets_go_after_s is not None:
-            ns = t_ns + round(1e9 * self._config.lets_go_after_s)
-            self._at(ns, self._stop_motor, self._firmware[self._config.lets_go], ns, OperatingMode.OFF)
+        super().begin_faults(t_ns)
+        if self.config.lets_go_after_s is not None:
+            ns = t_ns + round(1e9 * self.config.lets_go_after_s)
+            self._at(ns, self._stop_motor, self._firmware[self.config.lets_go], ns, OperatingMode.OFF)
 
     def unplugged(self, t_ns: int) -> bool:
         """Return whether the port is gone at a time [ns]."""
-        return self.has(self._config.unplugged_after_s, t_ns)
+        return self.has(self.config.unplugged_after_s, t_ns)
 
     def happens(self, probability: float) -> bool:
         """Return whether a fault happens; draws no random number if its probability is 0."""
@@ -245,23 +228,22 @@ class PlannedBus(FaultTimes, ABC):
 
     def ill(self, probability: float, t_ns: int) -> bool:
         """Return whether the answer to an instruction at a time [ns] is late, or wild, with this probability."""
-        return self.has(self._config.ill_after_s, t_ns) and self.happens(probability)
+        return self.has(self.config.ill_after_s, t_ns) and self.happens(probability)
 
     def configure(self, servo: Firmware) -> None:
-        """Pass a servo's controller settings to the plant if they have changed."""
+        """Pass a motor's controller settings to the plant if they have changed."""
         controller = servo.controller()
         if self._controllers.get(servo.servo_id) != controller:
             self._controllers[servo.servo_id] = controller
             self._clock.configure(servo.servo_id, *controller)
 
     def actuate(self, servo: Firmware, request: Request) -> None:
-        """Schedule the command of the servo's registers one actuation latency after the request."""
-        config = self._config
+        """Schedule the command of the motor's registers one actuation latency after the request."""
+        config = self.config
         if request.actuation_ns is None:
             request.actuation_ns = self._delay_ns(config.actuation_latency_s, config.actuation_jitter_s)
-        planned_ns = request.t_ns + request.actuation_ns
         # Commands take effect in the order in which they were sent.
-        planned_ns = max(planned_ns, self._last_effect_ns[servo.servo_id])
+        planned_ns = max(request.t_ns + request.actuation_ns, self._last_effect_ns[servo.servo_id])
         self._last_effect_ns[servo.servo_id] = planned_ns
         mode, goal = servo.command()
         if servo.servo_id == config.lets_go and self.has(config.lets_go_after_s, request.t_ns):
@@ -269,37 +251,30 @@ class PlannedBus(FaultTimes, ABC):
         self._clock.schedule(planned_ns, request.t_host_ns, servo.servo_id, mode, goal)
 
     def measure(self, servo: Firmware, t_ns: int) -> Sample:
-        """Set a servo's present values to those of one sensing latency before `t_ns`, and return the true ones."""
-        config = self._config
+        """Set a motor's present values to those of one sensing latency before `t_ns`, and return the true ones."""
+        config = self.config
         sampled_ns = t_ns - self._delay_ns(config.sensing_latency_s, config.sensing_jitter_s)
         values = self._clock.sample(servo.servo_id, sampled_ns)
         reported = values
         if self.has(config.frozen_after_s, t_ns):
             reported = self._frozen.setdefault(servo.servo_id, (values[0], 0.0, values[2]))
-        servo.refresh(*reported, tick_ms=(t_ns - self._start_ns) // 1_000_000)
+        servo.refresh(*reported, tick_ms=(t_ns - self.start_ns) // 1_000_000)
         return sampled_ns, values
 
     def reply(
         self, servo_id: int, request: Request, answer: bytes, return_delay_s: float, sample: Sample | None = None
     ) -> None:
-        """Schedule an answer: sent after the return delay when the wire is free, delivered at its last byte.
-
-        Args:
-            return_delay_s: Time between instruction and answer [s].
-        """
+        """Schedule an answer: sent after the return delay [s] when the wire is free, delivered at its last byte."""
         begin_ns = max(request.t_ns, self._wire_free_ns) + round(return_delay_s * 1e9)
         self._wire_free_ns = begin_ns + round(len(answer) * self._byte_ns)
         # A late answer delays the later ones, as in a USB adapter.
-        late_ns = round(self._config.late_s * 1e9) if self.ill(self._config.late, request.t_ns) else 0
+        late_ns = round(self.config.late_s * 1e9) if self.ill(self.config.late, request.t_ns) else 0
         self._delivered_ns = max(self._delivered_ns, self._wire_free_ns + late_ns)
         self._at(self._delivered_ns, self._deliver, self._delivered_ns, servo_id, answer, request, sample)
 
     def _at(self, t_ns: int, action: Callable[..., None], *arguments: Any) -> None:
         self._sequence += 1
         heapq.heappush(self._events, (t_ns, self._sequence, action, arguments))
-
-    def _silent(self, t_ns: int) -> bool:
-        return self.has(self._config.silent_after_s, t_ns)
 
     def _delay_ns(self, latency_s: float, jitter_s: float) -> int:
         return round(1e9 * (latency_s + self.random.uniform(-jitter_s, jitter_s)))
@@ -308,19 +283,19 @@ class PlannedBus(FaultTimes, ABC):
         kind = Kind.REPLY if sample is None else Kind.SAMPLE
         t_ns, values = sample or (request.t_ns, ())
         # Faults of the wire: a corrupted byte, or no answer at all.
-        if self.random.random() < self._config.corrupt:
+        if self.random.random() < self.config.corrupt:
             position = self.random.randrange(len(answer))
             answer = answer[:position] + bytes((answer[position] ^ 0x10,)) + answer[position + 1 :]
-        lost = self._silent(planned_ns) or self.random.random() < self._config.reply_loss
+        lost = self.is_silent(planned_ns) or self.random.random() < self.config.reply_loss
         if lost or not self._send(answer):
             kind = Kind.LOSS
         now_ns = self._now_ns()
-        self._truth.write(kind, servo_id, request.t_host_ns, t_ns, now_ns, now_ns - planned_ns, values)
+        self.truth.write(kind, servo_id, request.t_host_ns, t_ns, now_ns, now_ns - planned_ns, values)
 
     def _trip_watchdog(self, servo: Firmware, t_ns: int) -> None:
         self.measure(servo, t_ns)
         servo.trip_watchdog()
-        self._truth.write(Kind.WATCHDOG, servo.servo_id, 0, t_ns, t_ns, 0)
+        self.truth.write(Kind.WATCHDOG, servo.servo_id, 0, t_ns, t_ns, 0)
         if servo.watchdog_stops:
             self._stop_motor(servo, t_ns, servo.command()[0])
 
@@ -330,163 +305,6 @@ class PlannedBus(FaultTimes, ABC):
             self._stop_motor(servo, t_ns, OperatingMode.OFF)
 
     def _stop_motor(self, servo: Firmware, t_ns: int, mode: int) -> None:
-        """Stop the motor by the servo's own firmware: at once, dropping commands that have not taken effect yet."""
+        """Stop the motor by its own firmware: at once, dropping commands that have not taken effect yet."""
         self._clock.cancel(servo.servo_id)
         self._clock.schedule(t_ns, 0, servo.servo_id, mode, 0.0)
-
-
-S = TypeVar("S", bound=ServoFirmware)
-E = TypeVar("E", bound=BusEmulation)
-
-
-class InstructedBus(PlannedBus, Generic[S, E]):
-    """Emulated servos of one family on a bus, driving a plant; see `PlannedBus`.
-
-    Args:
-        send: Delivers the bytes of an answer to the host; returns False if the host cannot take them.
-        start_ns: Time 0 of the plant.
-
-    Attributes:
-        wild_counts: Range of positions out of the motors' reach.
-    """
-
-    family: ClassVar[Family]
-    wild_counts: ClassVar[tuple[int, int]]
-
-    def __init__(
-        self,
-        plant: Plant,
-        config: E,
-        truth: TruthLog,
-        send: Callable[[bytes], bool],
-        start_ns: int,
-        now_ns: Callable[[], int] = time.monotonic_ns,
-    ) -> None:
-        self.config, self.form = config, self.family.form
-        self.servos = {i: self.make_servo(i) for i in sorted(plant.servo_ids)}
-        self._handlers: dict[int, Callable[[Request, list[S]], None]] = {
-            Instruction.PING: self._ping,
-            Instruction.READ: self._read,
-            Instruction.WRITE: self._write,
-            Instruction.REG_WRITE: self._reg_write,
-            Instruction.ACTION: self._action,
-            Instruction.REBOOT: self._reboot,
-            Instruction.SYNC_READ: self._sync_read,
-            Instruction.SYNC_WRITE: self._sync_write,
-        }
-        super().__init__(plant, config, truth, send, start_ns, now_ns, Parser(self.form), self.servos)
-
-    @abstractmethod
-    def make_servo(self, servo_id: int) -> S:
-        """Return a servo with this bus's settings."""
-
-    def execute(self, request: Request) -> None:
-        """Carry out an instruction that is complete on the wire, and reply to it."""
-        packet = request.packet
-        # Every servo that receives the instruction resets its watchdog.
-        broadcast = packet.servo_id == BROADCAST_ID
-        targets = [s for i, s in self.servos.items() if broadcast or i == packet.servo_id]
-        if packet.intact:
-            for servo in targets:
-                servo.heard_ns = request.t_ns
-        handler = self._handlers.get(packet.code)
-        if targets and packet.intact and handler is not None:
-            handler(request, targets)
-        elif targets and not broadcast:
-            self._misunderstand(targets[0], request)
-
-    def _misunderstand(self, servo: S, request: Request) -> None:
-        """React to an instruction with a wrong checksum, or an unknown one: here without an answer."""
-
-    def _misread(self, servo: S, request: Request) -> None:
-        """React to a READ of a wrong length: here without an answer."""
-
-    def _ping(self, request: Request, targets: list[S]) -> None:
-        """Answer a ping."""
-        for servo in targets:
-            self._answer(servo, request, 0, servo.identity)
-
-    def _answer(self, servo: S, request: Request, error: int, data: bytes = b"", sample: Sample | None = None) -> None:
-        """Let a servo answer, with its measurement if the answer has present values."""
-        status = self._status(servo, error | servo.alert, data)
-        self.reply(servo.servo_id, request, status, servo.return_delay_s, sample)
-
-    def _status(self, servo: S, error: int, data: bytes) -> bytes:
-        """Return the bytes of an answer."""
-        return self.form.build_status(servo.servo_id, error, data)
-
-    def _confirm(self, servo: S, request: Request, error: int) -> None:
-        """Let a servo answer an instruction that writes."""
-        if request.packet.servo_id != BROADCAST_ID and servo.confirms:
-            self._answer(servo, request, error)
-
-    def _answer_read(self, servo: S, request: Request, position: int) -> None:
-        """Let a servo answer a read whose address and length begin at a position in the parameters."""
-        address = self.form.word(request.packet.parameters, position)
-        length = self.form.word(request.packet.parameters, position + self.form.address_bytes)
-        sample = self.measure(servo, request.t_ns)
-        if self.ill(self._config.wild, request.t_ns):
-            servo.put(self.family.position, self.random.randrange(*self.wild_counts))
-        error, data = servo.read(address, length)
-        if servo.answers_reads:
-            present = self.family.position, self.family.velocity, self.family.load
-            measured = any(address < r.end and address + length > r.address for r in present)
-            self._answer(servo, request, error, data, sample if measured else None)
-
-    def _read(self, request: Request, targets: list[S]) -> None:
-        if request.packet.servo_id == BROADCAST_ID:
-            return
-        if len(request.packet.parameters) != 2 * self.form.address_bytes:
-            self._misread(targets[0], request)
-            return
-        self._answer_read(targets[0], request, 0)
-
-    def _sync_read(self, request: Request, targets: list[S]) -> None:
-        del targets
-        for servo_id in request.packet.parameters[2 * self.form.address_bytes :]:
-            if servo_id in self.servos:
-                self._answer_read(self.servos[servo_id], request, 0)
-
-    def _write(self, request: Request, targets: list[S]) -> None:
-        address, data = self._place(request)
-        for servo in targets:
-            self._confirm(servo, request, self._carry_out(servo, request, lambda s: s.write(address, data)))
-
-    def _sync_write(self, request: Request, targets: list[S]) -> None:
-        del targets
-        parameters, begin = request.packet.parameters, 2 * self.form.address_bytes
-        address, length = self.form.word(parameters, 0), self.form.word(parameters, self.form.address_bytes)
-        for i in range(begin, len(parameters) - length, length + 1):
-            if parameters[i] in self.servos:
-                data = parameters[i + 1 : i + 1 + length]
-                self._carry_out(self.servos[parameters[i]], request, lambda s, data=data: s.write(address, data))
-
-    def _reg_write(self, request: Request, targets: list[S]) -> None:
-        for servo in targets:
-            servo.register_write(*self._place(request))
-            self._confirm(servo, request, 0)
-
-    def _action(self, request: Request, targets: list[S]) -> None:
-        for servo in targets:
-            self._confirm(servo, request, self._carry_out(servo, request, lambda s: s.action()))
-
-    def _reboot(self, request: Request, targets: list[S]) -> None:
-        for servo in targets:
-            self._confirm(servo, request, 0)
-            servo.reboot()
-            self.configure(servo)
-            self.actuate(servo, request)
-
-    def _carry_out(self, servo: S, request: Request, change: Callable[[S], tuple[int, bool]]) -> int:
-        """Let a servo change its registers, and the motor follow; return the error."""
-        self.measure(servo, request.t_ns)
-        error, moves = change(servo)
-        self.configure(servo)
-        if moves:
-            self.actuate(servo, request)
-        return error
-
-    def _place(self, request: Request) -> tuple[int, bytes]:
-        """Return the address and the data of an instruction that writes."""
-        parameters = request.packet.parameters
-        return self.form.word(parameters, 0), parameters[self.form.address_bytes :]

@@ -20,45 +20,21 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 
 from sim2real.emulation.bus import BusEmulation
-from sim2real.emulation.truth import Kind, Truth
-from sim2real.emulation.virtual import VirtualRobot
+from sim2real.emulation.truth import Kind
+from sim2real.emulation.virtual import VirtualRobot, VirtualTime
 from sim2real.errors import HardwareLost, SafetyStop
-from sim2real.hardware.clock import Clock
 from sim2real.hardware.device import Device, OperatingMode, Reading
 from sim2real.hardware.safety.gate import GateConfig
 from sim2real.hardware.safety.plausibility import require_parts
 from sim2real.hardware.safety.rig import Rig
 
-
-class EmulatedRobot(Protocol):
-    """An emulated robot in virtual time, behind an address; see `VirtualTime`.
-
-    Attributes:
-        port: The address.
-        clock: The time of the robot and of its device.
-    """
-
-    port: str
-    clock: Clock
-
-    def stop(self) -> None:
-        """End the robot, after which its truth is complete. May be called twice."""
-
-    def kill_host(self) -> None:
-        """Let the device's process die: its connections to the robot and to the guardian are closed."""
-
-    def truth(self) -> Truth:
-        """Return the true samples, and the modes in which motors were driven (`Kind.EFFECT`, first value)."""
-        ...
-
-
-Started = Callable[..., tuple[EmulatedRobot, Device]]
+Started = Callable[..., tuple[VirtualTime, Device]]
 
 
 class DeviceConformance(ABC):
@@ -88,8 +64,8 @@ class DeviceConformance(ABC):
     def make_device(self, port: str) -> Device:
         """Return the device on a port, not opened yet, with a `silence_s` of 0.3 s to 1 s."""
 
-    def make_robot(self, truth_path: Path, **settings: Any) -> EmulatedRobot:
-        """Return the emulator, started: latencies and faults have the names of `emulation.faults.Emulation`."""
+    def make_robot(self, truth_path: Path, **settings: Any) -> VirtualTime:
+        """Return the emulator, started: latencies and faults have the names of `emulation.robot.Emulation`."""
         config = self.emulation(**{**self.settings, **settings})
         return VirtualRobot(self.plant, config, self.plant_args, truth_path)
 
@@ -104,10 +80,10 @@ class DeviceConformance(ABC):
     @pytest.fixture
     def start(self, tmp_path: Path) -> Iterator[Started]:
         """Yield a function that starts an emulator with settings, and returns it with its device, not opened yet."""
-        robots: list[EmulatedRobot] = []
+        robots: list[VirtualTime] = []
         devices: list[Device] = []
 
-        def begin(**settings: Any) -> tuple[EmulatedRobot, Device]:
+        def begin(**settings: Any) -> tuple[VirtualTime, Device]:
             robots.append(self.make_robot(tmp_path / f"truth{len(robots)}.bin", **settings))
             devices.append(self.make_device(robots[-1].port))
             return robots[-1], devices[-1]
@@ -127,7 +103,7 @@ class DeviceConformance(ABC):
             device.clock.sleep(0.01)
         return readings
 
-    def require_safe(self, robot: EmulatedRobot, device: Device) -> None:
+    def require_safe(self, robot: VirtualTime, device: Device) -> None:
         """Check on the emulator that every motor was driven, and ends in the safe state."""
         robot.clock.sleep(0.05)  # until the last command has taken effect
         rows = robot.truth().of(Kind.EFFECT)

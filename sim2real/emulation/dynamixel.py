@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
-from sim2real.emulation.bus import BusEmulation, InstructedBus, Request
-from sim2real.emulation.firmware import ServoFirmware
+from sim2real.emulation.bus import BusEmulation, Request
+from sim2real.emulation.servos import ServoBus, ServoFirmware
 from sim2real.hardware import dynamixel as reg
 from sim2real.hardware.bus.packets import Instruction
 from sim2real.hardware.bus.registers import Register
@@ -42,26 +42,21 @@ class EmulatedServo(ServoFirmware):
 
     @property
     def answers_reads(self) -> bool:
-        """Whether it answers when it is read."""
         return self.get(reg.STATUS_RETURN_LEVEL) >= 1
 
     @property
     def confirms(self) -> bool:
-        """Whether it answers when it is written."""
         return self.get(reg.STATUS_RETURN_LEVEL) >= 2
 
     @property
     def identity(self) -> bytes:
-        """Model number and firmware version."""
         return reg.MODEL_NUMBER.encode(self.get(reg.MODEL_NUMBER)) + bytes((self.get(reg.FIRMWARE_VERSION),))
 
     @property
     def alert(self) -> int:
-        """The alert bit of status packets: 0x80 while a hardware error is present, else 0."""
         return ALERT_BIT if self.get(reg.HARDWARE_ERROR_STATUS) else 0
 
     def driven(self) -> tuple[int, float]:
-        """Return PWM and a fraction in [-1, 1], POSITION [rad], or VELOCITY [rad/s]."""
         mode = self.get(reg.OPERATING_MODE)
         if self.watchdog_stops and self.get(reg.BUS_WATCHDOG) < 0:
             return OperatingMode.PWM, 0.0
@@ -79,17 +74,11 @@ class EmulatedServo(ServoFirmware):
         self.put(reg.REALTIME_TICK, tick_ms % 32768)
 
     def read(self, address: int, length: int) -> tuple[int, bytes]:
-        """Return the error and the bytes of the answer to a READ."""
         if length == 0 or address + length > self.family.size:
             return StatusError.ACCESS, b""
         return StatusError.NONE, bytes(self._memory[address : address + length])
 
-    def action(self) -> tuple[int, bool]:
-        """Carry out the stored write; without one, the result is an instruction error."""
-        return (StatusError.INSTRUCTION, False) if self._registered is None else super().action()
-
     def trip_watchdog(self) -> None:
-        """Trip the bus watchdog: it refuses goals until it is set to 0, and the motor stops on some models."""
         if self.watchdog_stops:
             self.switched_on()
         self.put(reg.BUS_WATCHDOG, -1)
@@ -106,7 +95,6 @@ class EmulatedServo(ServoFirmware):
         self.put(reg.GOAL_POSITION, self.get(reg.PRESENT_POSITION))
 
     def misfit(self, address: int, data: bytes, whole: list[Register]) -> int:
-        """Return the error for data that are not whole registers in a row."""
         if not data:
             return StatusError.DATA_LENGTH
         for register in whole:
@@ -117,7 +105,6 @@ class EmulatedServo(ServoFirmware):
         return StatusError.NONE if not data else StatusError.DATA_LENGTH if cut else StatusError.ACCESS
 
     def refusal(self, register: Register, value: int) -> int:
-        """Return the firmware's reason to refuse a value, or NONE."""
         if not register.writable or (register.eeprom and self.get(reg.TORQUE_ENABLE)):
             return StatusError.ACCESS
         if register in self.fixed and value != self.get(register):
@@ -143,40 +130,25 @@ class EmulatedServo(ServoFirmware):
         return False
 
 
-class EmulatedBus(InstructedBus[EmulatedServo, "EmulatorConfig"]):
-    """Emulated DYNAMIXEL servos on a bus, driving a plant; see `InstructedBus`."""
+class EmulatedBus(ServoBus[EmulatedServo, "EmulatorConfig"]):
+    """Emulated DYNAMIXEL servos on a bus, driving a plant; see `ServoBus`."""
 
     family = reg.FAMILY
     wild_counts = (1 << 24, 1 << 31)
 
-    def __init__(self, *arguments: Any) -> None:
-        super().__init__(*arguments)
-        self._handlers[Instruction.BULK_READ] = self._bulk_read
-
-    def make_servo(self, servo_id: int) -> EmulatedServo:
-        """Return a servo with this bus's settings."""
-        c = self.config
-        return EmulatedServo(servo_id, c.model_number, c.return_delay_us, c.encoder_counts, c.watchdog_stops)
+    def make_servo(self, servo_id: int, config: EmulatorConfig) -> EmulatedServo:
+        settings = config.model_number, config.return_delay_us, config.encoder_counts, config.watchdog_stops
+        return EmulatedServo(servo_id, *settings)
 
     def execute(self, request: Request) -> None:
-        """Carry out an instruction that is complete on the wire, and reply to it."""
         if request.packet.code != Instruction.STATUS:
             super().execute(request)
 
     def _misunderstand(self, servo: EmulatedServo, request: Request) -> None:
-        """Answer an instruction with its error."""
         self._answer(servo, request, StatusError.INSTRUCTION if request.packet.intact else StatusError.CRC)
 
     def _misread(self, servo: EmulatedServo, request: Request) -> None:
-        """Answer a READ of a wrong length with an error."""
         self._confirm(servo, request, StatusError.DATA_LENGTH)
-
-    def _bulk_read(self, request: Request, targets: list[EmulatedServo]) -> None:
-        del targets
-        parameters = request.packet.parameters
-        for i in range(0, len(parameters) - 4, 5):
-            if parameters[i] in self.servos:
-                self._answer_read(self.servos[parameters[i]], request, i + 1)
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,11 @@
-"""The physics of emulated servos: a plant's protocol, the clock that steps it, and mountings of its joints."""
+"""The physics of emulated robots: protocols of plants and bodies, the clock that steps a plant, and mountings."""
 
 import heapq
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, Protocol, runtime_checkable
+
+import numpy as np
 
 from sim2real.emulation.truth import Kind, TruthLog
 from sim2real.errors import UsageError
@@ -28,7 +30,6 @@ class Plant(Protocol):
 
         It is called with k * plant_step_s, k = 1, 2, ... The plant's own step must divide `plant_step_s`; to avoid
         drift, make `round((t_s - now) / step)` steps.
-
         """
         ...
 
@@ -69,6 +70,50 @@ class ConfigurablePlant(Plant, Protocol):
             profile_velocity_rad_s: Speed at which the setpoint moves to the goal [rad/s]; inf: the setpoint is the
                 goal.
         """
+        ...
+
+
+def measured_dtype(motors: int) -> np.dtype:
+    """Return the layout of a body's measurement; every entry is a double.
+
+    Its fields have the names and units of ``LowState``: ``q`` [rad], ``dq`` [rad/s] and ``tau_est`` [N m] of each
+    motor, ``quaternion`` (w first), ``gyroscope`` [rad/s], ``accelerometer`` [m/s^2], and ``foot_force`` [N].
+    """
+    sizes = {"q": motors, "dq": motors, "tau_est": motors, "quaternion": 4, "gyroscope": 3, "accelerometer": 3}
+    return np.dtype([(name, np.float64, (size,)) for name, size in {**sizes, "foot_force": 4}.items()])
+
+
+class Body(Protocol):
+    """A robot on legs, driven by motors with a law each; used by the emulator alone, in one thread.
+
+    Times count from the emulator's start [s].
+
+    Attributes:
+        motors: Number of motors.
+        step_s: Time step of the physics [s].
+    """
+
+    motors: int
+    step_s: float
+
+    def drive(self, law: np.ndarray) -> None:
+        """Set the laws of all motors from the present time on, ``(motors, 5)``: q, dq, kp, kd and tau."""
+        ...
+
+    def step(self) -> None:
+        """Integrate one time step."""
+        ...
+
+    def measure(self) -> np.ndarray:
+        """Return a measurement without noise, of `measured_dtype` and shape ``()``."""
+        ...
+
+    def state(self) -> dict[str, float]:
+        """Return the true state for the truth log, with the same names at every call."""
+        ...
+
+    def truth(self) -> dict[str, object]:
+        """Return the true parameters, which an identification should find."""
         ...
 
 
@@ -192,18 +237,14 @@ class MountedPlant:
     def __init__(
         self, plant: str, plant_args: Mapping[str, Any], joints: Sequence[Mapping[str, Any]], zero_rad: float
     ) -> None:
-        self._plant, self._zero_rad = load_plant(plant, plant_args), zero_rad
-        self.servo_ids = tuple(self._plant.servo_ids)
+        inside = load_plant(plant, plant_args)
+        self._plant, self._zero_rad, self.servo_ids = inside, zero_rad, tuple(inside.servo_ids)
         if len(joints) != len(self.servo_ids):
             raise UsageError(f"{len(joints)} joints are mounted on {len(self.servo_ids)} servos")
         self._joints = {i: Joint(**fields) for i, fields in zip(self.servo_ids, joints, strict=True)}
-
-    def advance(self, t_s: float) -> None:
-        """Integrate up to ``t_s`` [s]."""
-        self._plant.advance(t_s)
+        self.advance, self.state, self.truth = inside.advance, inside.state, inside.truth
 
     def command(self, servo_id: int, mode: int, goal: float) -> None:
-        """Command a servo; see `Plant.command`. The goal is the servo's, not its joint's."""
         joint = self._joints[servo_id]
         if mode in (OperatingMode.POSITION, OperatingMode.EXTENDED_POSITION):
             goal = joint.angle(goal - self._zero_rad) + self._zero_rad
@@ -214,22 +255,12 @@ class MountedPlant:
         self._plant.command(servo_id, mode, goal)
 
     def configure(self, servo_id: int, p_gain: int, d_gain: int, profile_velocity_rad_s: float) -> None:
-        """Set a servo's position controller if the plant inside has one; see `ConfigurablePlant`."""
         if isinstance(self._plant, ConfigurablePlant):
             speed = profile_velocity_rad_s / self._joints[servo_id].gear
             self._plant.configure(servo_id, p_gain, d_gain, speed)
 
     def measure(self, servo_id: int) -> tuple[float, float, float]:
-        """Return the encoder's angle from count 0 [rad], its speed [rad/s], and the servo's load."""
         joint = self._joints[servo_id]
         angle, speed, load = self._plant.measure(servo_id)
         encoder = joint.encoder(angle - self._zero_rad) + self._zero_rad
         return encoder, joint.direction * joint.gear * speed, joint.direction * load
-
-    def state(self) -> dict[str, float]:
-        """Return the true state of the plant inside."""
-        return self._plant.state()
-
-    def truth(self) -> dict[str, Any]:
-        """Return the true parameters of the plant inside."""
-        return self._plant.truth()

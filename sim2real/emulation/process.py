@@ -1,14 +1,13 @@
 """An emulated robot in a process of its own, in real time: the host's side starts and stops it, the other side runs it.
 
-    python -m sim2real.emulation.process --emulation sim2real.emulation.dynamixel:EmulatorConfig \
-        --plant my_robot/plant.py:Plant --truth truth.bin --sensing-latency-s 0.004
+    python -m sim2real.emulation.process '{"emulation": "sim2real.emulation.dynamixel:EmulatorConfig",
+        "settings": {"sensing_latency_s": 0.004}, "plant": "my_robot/plant.py:Plant", "truth": "truth.bin"}'
 
 prints one line of JSON with the port when it is ready, and runs until SIGTERM.
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import ctypes
 import gc
@@ -23,14 +22,14 @@ import tempfile
 import termios
 import time
 import tty
-from collections.abc import Mapping, Sequence
-from dataclasses import Field, asdict, fields, is_dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, ClassVar, Final, Protocol, Self, cast
+from typing import IO, TYPE_CHECKING, Any, Final, Protocol, Self, cast
 
 from sim2real.emulation.bus import BusEmulation, PlannedBus
-from sim2real.emulation.faults import truth_header
 from sim2real.emulation.plant import load_plant
+from sim2real.emulation.robot import Emulation, PlannedRobot, truth_header
 from sim2real.emulation.truth import Truth, TruthLog, read_truth
 from sim2real.errors import HardwareLost, Sim2RealError, UsageError
 from sim2real.hardware.clock import SYSTEM_CLOCK, Clock
@@ -42,35 +41,11 @@ if TYPE_CHECKING:
 _LOGGER = logging.getLogger(__name__)
 _START_TIMEOUT_S: Final = 20.0
 _STOP_TIMEOUT_S: Final = 3.0
-_IDLE_NS: Final = 2_000_000  # longest time without stepping the plant: catching up with more would delay answers
 _PR_SET_TIMERSLACK: Final = 29
 _TIMER_SLACK_NS: Final = 1_000
 _REAL_TIME_PRIORITY: Final = 2  # above the threads of the controlling process, which have 1: a servo does not wait
 _NOT_SET: Final = termios.B50  # until a host sets a rate; no servo has this one
 _SPEEDS: Final = {r: getattr(termios, f"B{r}", -1) for r in (38_400, 57_600, 115_200, 500_000, 1_000_000, 2_000_000)}
-_TYPES: Final = {"int": int, "float": float, "bool": {"True": True, "False": False}.__getitem__}
-
-
-class Emulated(Protocol):
-    """Settings of an emulated robot: a dataclass whose fields become flags of its process.
-
-    Attributes:
-        serve: ``module:function`` that emulates the robot: called with the options of the command line, these settings
-            and a `StopFlag`, it returns when the flag is set.
-        actuation_latency_s: Time from a command to its effect [s].
-        actuation_jitter_s: Half-width of the variation of that time [s].
-    """
-
-    __dataclass_fields__: ClassVar[dict[str, Field]]
-    serve: ClassVar[str]
-    if TYPE_CHECKING:
-
-        @property
-        def seed(self) -> int: ...
-        @property
-        def actuation_latency_s(self) -> float: ...
-        @property
-        def actuation_jitter_s(self) -> float: ...
 
 
 class EmbeddedRobot:
@@ -96,7 +71,7 @@ class EmbeddedRobot:
     def __init__(
         self,
         plant: str,
-        config: Emulated,
+        config: Emulation,
         plant_args: Mapping[str, Any] | None = None,
         truth_path: Path | str | None = None,
     ) -> None:
@@ -105,13 +80,16 @@ class EmbeddedRobot:
         self.truth_path = Path(truth_path) if truth_path is not None else folder / "truth.bin"
         self.truth_path.parent.mkdir(parents=True, exist_ok=True)
         self._messages_path = folder / "messages.txt"
-        # The settings become flags. -P: files in the user's working directory must not be imported as modules.
-        command = [sys.executable, "-P", "-m", "sim2real.emulation.process", "--until-stdin-closes", "--plant", plant]
-        command += ["--emulation", f"{type(config).__module__}:{type(config).__qualname__}"]
-        command += ["--truth", str(self.truth_path), "--plant-args", json.dumps(dict(plant_args or {}))]
-        for name, value in asdict(config).items():
-            if value is not None:
-                command.append(f"--{name.replace('_', '-')}={value!r}")
+        task = {
+            "emulation": f"{type(config).__module__}:{type(config).__qualname__}",
+            "settings": asdict(config),
+            "plant": plant,
+            "plant_args": dict(plant_args or {}),
+            "truth": str(self.truth_path),
+            "until_stdin_closes": True,
+        }
+        # -P: files in the user's working directory must not be imported as modules.
+        command = [sys.executable, "-P", "-m", "sim2real.emulation.process", json.dumps(task)]
         with self._messages_path.open("wb") as messages:
             # In a new session, so that Ctrl-C in a terminal reaches only the host, which then stops the robot.
             self._process = subprocess.Popen(
@@ -123,11 +101,9 @@ class EmbeddedRobot:
         self.pid: int = ready["pid"]
 
     def __enter__(self) -> Self:
-        """Return the running robot."""
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """Stop it."""
         self.stop()
 
     @property
@@ -175,11 +151,35 @@ class EmbeddedRobot:
         return self._messages_path.read_text(errors="replace").strip() or "without a message"
 
 
+class Connection(Protocol):
+    """The robot's end of its connection to the host.
+
+    Attributes:
+        port: The host's address of it.
+        inputs: File descriptors that become ready when the host has sent something.
+        idle_ns: Longest time between two exchanges [ns].
+    """
+
+    port: str
+    inputs: tuple[int, ...]
+    idle_ns: int
+
+    def exchange(self, robot: Any, now_ns: int, ready: list[int]) -> None:
+        """Pass what the host has sent on to the robot; ``ready``: the inputs that are."""
+        ...
+
+    def close(self) -> None:
+        """Close the connection."""
+        ...
+
+
 class _Pty:
-    """A raw pseudo-terminal: the host opens `port`, the emulator has the other end.
+    """A raw pseudo-terminal: the host opens `port`, the emulator has the other end; a `Connection`.
 
     The host's end is kept open here too, so that hosts may open and close it.
     """
+
+    idle_ns = 2_000_000  # without stepping the plant: catching up with more would delay answers
 
     def __init__(self) -> None:
         self.fd, self._host_fd = os.openpty()
@@ -188,21 +188,19 @@ class _Pty:
         settings[4:6] = [_NOT_SET, _NOT_SET]
         termios.tcsetattr(self._host_fd, termios.TCSANOW, settings)
         os.set_blocking(self.fd, False)
-        self.port = os.ttyname(self._host_fd)
+        self.port, self.inputs = os.ttyname(self._host_fd), (self.fd,)
 
-    def unplug(self) -> None:
-        """Take the port away: the host's reads and writes fail from now on."""
-        if self.fd >= 0:
-            os.close(self._host_fd)
-            os.close(self.fd)
-            self.fd = -1
+    def exchange(self, robot: PlannedBus[Any], now_ns: int, ready: list[int]) -> None:
+        """Pass bytes on; take the port away when it is unplugged: the host's reads and writes fail from then on."""
+        if self.inputs and robot.unplugged(now_ns):
+            self.close()
+        elif self.fd in ready:
+            robot.feed(self.receive(robot.baud_rate), now_ns)
 
     def send(self, answer: bytes) -> bool:
         """Send bytes to the host; return False if the buffer is full or the port is gone."""
-        if self.fd < 0:
-            return False
         try:
-            return os.write(self.fd, answer) == len(answer)
+            return bool(self.inputs) and os.write(self.fd, answer) == len(answer)
         except BlockingIOError:
             return False
 
@@ -217,6 +215,12 @@ class _Pty:
             baud_rate not in _SPEEDS and speed not in _SPEEDS.values()
         )
         return data if fits else b""
+
+    def close(self) -> None:
+        if self.inputs:
+            os.close(self._host_fd)
+            os.close(self.fd)
+            self.inputs = ()
 
 
 class StopFlag:
@@ -238,35 +242,86 @@ class StopFlag:
         self.faulty_ns = time.monotonic_ns()
 
 
-def _serve(bus: PlannedBus, pty: _Pty, truth: TruthLog, stop: StopFlag, parent_fd: int | None) -> None:
-    """Run the bus until `stop` is set; with `parent_fd`, also until the other end of that pipe is closed."""
-    inputs = [pty.fd] if parent_fd is None else [pty.fd, parent_fd]
+@dataclass(frozen=True)
+class Task:
+    """What a process emulates.
+
+    Attributes:
+        emulation: ``MODULE_OR_FILE:NAME`` of the class of the settings.
+        settings: Its fields.
+        plant: ``MODULE_OR_FILE:NAME`` of the callable that returns the physics.
+        plant_args: Its keyword arguments.
+        truth: The file of true states and latencies.
+        until_stdin_closes: Whether it also stops when stdin ends, as when the parent dies.
+    """
+
+    emulation: str
+    plant: str
+    truth: str
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    plant_args: Mapping[str, Any] = field(default_factory=dict)
+    until_stdin_closes: bool = False
+
+
+def serve(
+    task: Task,
+    config: Emulation,
+    stop: StopFlag,
+    connect: Callable[[], Any],
+    make: Callable[[Any, TruthLog, int, Any], PlannedRobot[Any]],
+) -> None:
+    """Emulate a robot until the flag is set.
+
+    Args:
+        connect: Opens the `Connection`; its threads take no part in the real-time priority.
+        make: Makes the robot from its physics, its truth, the time of its start [ns], and the connection.
+    """
+    physics, path = load_plant(task.plant, task.plant_args), Path(task.truth)
+    connection: Connection = connect()
+    _keep_time()
+    start_ns = time.monotonic_ns()
+    truth = TruthLog(path, truth_header(physics, config, start_ns))
+    # Report the port to the parent, and serve until the end.
+    try:
+        robot = make(physics, truth, start_ns, connection)
+        ready = {"port": connection.port, "pid": os.getpid(), "truth": str(path.resolve())}
+        print(json.dumps(ready), flush=True)
+        _run(robot, connection, truth, stop, [sys.stdin.fileno()] if task.until_stdin_closes else [])
+    finally:
+        truth.close()
+        connection.close()
+
+
+def serve_bus(task: Task, config: BusEmulation, stop: StopFlag) -> None:
+    """Emulate servos behind a pseudo-terminal until the flag is set."""
+    make = config.bus_type
+    serve(task, config, stop, _Pty, lambda plant, truth, ns, pty: make(plant, config, truth, pty.send, ns))
+
+
+def _run(
+    robot: PlannedRobot[Any], connection: Connection, truth: TruthLog, stop: StopFlag, parent_fds: list[int]
+) -> None:
+    """Run the robot until ``stop`` is set, or the other end of the parent's pipe is closed."""
     while not stop.is_set:
-        # Sleep until bytes arrive or the next event is due.
+        # Sleep until the host has sent something, or the next event is due.
         now_ns = time.monotonic_ns()
-        wake_ns = now_ns + _IDLE_NS
-        due_ns = bus.next_due_ns()
-        if due_ns is not None:
-            wake_ns = min(wake_ns, due_ns)
+        due_ns, wake_ns = robot.next_due_ns(), now_ns + connection.idle_ns
+        wake_ns = wake_ns if due_ns is None else min(wake_ns, due_ns)
+        inputs = [*connection.inputs, *parent_fds]
         ready = select.select(inputs, [], [], max(0, wake_ns - now_ns) * 1e-9)[0]
-        # Faults that a signal or the settings start.
         now_ns = time.monotonic_ns()
         if stop.faulty_ns is not None:
-            bus.begin_faults(stop.faulty_ns)
+            robot.begin_faults(stop.faulty_ns)
             stop.faulty_ns = None
-        if pty.fd >= 0 and bus.unplugged(now_ns):
-            inputs.remove(pty.fd)
-            pty.unplug()
-        # Pass the bytes on, then compute all events up to now.
-        if pty.fd in ready:
-            bus.feed(pty.receive(bus.baud_rate), now_ns)
-        if parent_fd in ready and not os.read(parent_fd, 1024):
+        # Pass on what was sent, then compute all events up to now.
+        connection.exchange(robot, now_ns, ready)
+        if any(fd in ready and not os.read(fd, 1024) for fd in parent_fds):
             return
-        bus.run_until(now_ns)
+        robot.run_until(now_ns)
         truth.flush_if_due(now_ns)
 
 
-def keep_time() -> None:
+def _keep_time() -> None:
     """Reduce the lateness of this process as far as the operating system allows."""
     # Sleeps end within about 1 us of the requested time, instead of 50 us.
     with contextlib.suppress(AttributeError, OSError):
@@ -279,69 +334,18 @@ def keep_time() -> None:
     gc.disable()
 
 
-def _parser(arguments: Sequence[str] | None) -> argparse.ArgumentParser:
-    """Return the parser of the command line, with a flag for each setting of the named emulation."""
-    parser = argparse.ArgumentParser(prog="python -m sim2real.emulation.process", description=__doc__, add_help=False)
-    place = "MODULE_OR_FILE:NAME"
-    parser.add_argument(
-        "--emulation", required=True, metavar=place, help="the class of the settings, which makes the bus"
-    )
-    # The class of the settings decides the other flags.
-    named = parser.parse_known_args(arguments)[0]
-    settings = load_named(named.emulation, "emulation")
-    if not (isinstance(settings, type) and is_dataclass(settings) and hasattr(settings, "serve")):
-        raise UsageError(f"emulation {named.emulation!r} is not a class of settings of an emulated robot")
-    parser.set_defaults(settings=settings)
-    parser.add_argument("-h", "--help", action="help")
-    parser.add_argument("--plant", required=True, metavar=place, help="the callable that returns the plant")
-    parser.add_argument("--plant-args", default="{}", metavar="JSON", help="keyword arguments of --plant")
-    parser.add_argument(
-        "--truth", type=Path, required=True, metavar="FILE", help="the log of true states and latencies"
-    )
-    parser.add_argument(
-        "--until-stdin-closes", action="store_true", help="also stop when stdin ends, as when the parent dies"
-    )
-    # One flag for each setting.
-    for field in fields(settings):
-        flag = f"--{field.name.replace('_', '-')}"
-        parser.add_argument(flag, type=_TYPES[str(field.type).split()[0]], default=field.default)
-    return parser
-
-
-def plant_arguments(text: str) -> dict[str, Any]:
-    """Return the keyword arguments of --plant-args; UsageError if they are no JSON object."""
+def main(arguments: Sequence[str]) -> int:
+    """Emulate the robot of a task, which is JSON; return the exit code."""
     try:
-        arguments = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise UsageError(f"--plant-args is no JSON: {error}") from error
-    if not isinstance(arguments, dict):
-        raise UsageError(f"--plant-args must be a JSON object, not {text}")
-    return arguments
-
-
-def serve_bus(options: argparse.Namespace, config: BusEmulation, stop: StopFlag) -> None:
-    """Emulate servos behind a pseudo-terminal until the flag is set."""
-    plant = load_plant(options.plant, plant_arguments(options.plant_args))
-    pty = _Pty()
-    keep_time()
-    start_ns = time.monotonic_ns()
-    truth = TruthLog(options.truth, truth_header(plant, config, start_ns))
-    # Report the port to the parent, and serve until the end.
-    try:
-        bus = config.bus(plant, truth, pty.send, start_ns)
-        ready = {"port": pty.port, "pid": os.getpid(), "truth": str(options.truth.resolve())}
-        print(json.dumps(ready), flush=True)
-        _serve(bus, pty, truth, stop, sys.stdin.fileno() if options.until_stdin_closes else None)
-    finally:
-        truth.close()
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line of an emulated robot; return its exit code."""
-    try:
-        options = _parser(arguments).parse_args(arguments)
-        config = options.settings(**{field.name: getattr(options, field.name) for field in fields(options.settings)})
-        load_named(config.serve, "emulation")(options, config, StopFlag())
+        try:
+            task = Task(**json.loads(arguments[0]))
+        except (IndexError, TypeError, ValueError) as error:
+            raise UsageError(f"the task is no JSON object with the fields of Task: {error}") from error
+        kind = load_named(task.emulation, "emulation")
+        if not (isinstance(kind, type) and issubclass(kind, Emulation)):
+            raise UsageError(f"emulation {task.emulation!r} is not a class of settings of an emulated robot")
+        config = kind(**task.settings)
+        load_named(config.serve, "emulation")(task, config, StopFlag())
     except Sim2RealError as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code
@@ -349,4 +353,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(sys.argv[1:]))

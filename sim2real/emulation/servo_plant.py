@@ -112,7 +112,6 @@ class ServoPlant:
         self._friction, self._damping = self.model.dof_frictionloss, self.model.dof_damping
 
     def advance(self, t_s: float) -> None:
-        """Integrate up to ``t_s`` [s]."""
         model, data, step_s = self.model, self.data, self.model.opt.timestep
         for _ in range(round((t_s - data.time) / step_s)):
             angles, speeds = self._qpos[self._at].tolist(), self._qvel[self._dofs].tolist()
@@ -137,7 +136,6 @@ class ServoPlant:
         self._damping[self._dofs[i]] = (self._on if self._is_on(i) else self._off)[i]
 
     def configure(self, servo_id: int, p_gain: int, d_gain: int, profile_velocity_rad_s: float) -> None:
-        """Set a servo's P gain [counts], and the largest speed of its setpoint [rad/s]; inf is no limit."""
         i = self.servo_ids.index(servo_id)
         self._p_gain[i], self._profile[i] = float(p_gain), profile_velocity_rad_s
 

@@ -1,8 +1,9 @@
 """Emulated robots in this process and in virtual time: no thread, no waiting, every instant exact.
 
-`VirtualRobot` is the robot behind an address, the port of whoever opens that address, and the clock of both. Time goes
-on while the host waits for an answer or sleeps, event by event; it stands still while the host computes. The guardian
-is the guardian process's own code, without the process: it acts when it is due, and the host goes on when it has acted.
+A `VirtualRobot` is the robot behind an address, the port of whoever opens that address, and the clock of both. Time
+goes on while the host waits for an answer or sleeps, event by event; it stands still while the host computes. The
+guardian is the guardian process's own code, without the process: it acts when it is due, and the host goes on when it
+has acted.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from sim2real.emulation.bus import BusEmulation
-from sim2real.emulation.faults import truth_header
 from sim2real.emulation.plant import Plant, load_plant
+from sim2real.emulation.robot import Emulation, Physics, PlannedRobot, truth_header
 from sim2real.emulation.truth import Truth, TruthLog, read_truth
 from sim2real.errors import HardwareLost
 from sim2real.hardware.bus.port import CUT, EMULATED, Port, Queries, take_torque_off
@@ -30,42 +31,46 @@ NUMBERS: Final = count()
 
 
 class VirtualTime(ABC):
-    """The clock of an emulated robot, its guardian, and the ends of its host; a subclass is the robot.
+    """The clock of an emulated robot, its guardian, and the ends of its host.
 
     Attributes:
+        port: Its address.
         clock: The robot itself.
+        planned: The robot in planned time.
         reports: What the guardian told a person.
         guardian_lives: False: the guardian's process has died.
         host_lives: False: the host's process has died.
     """
 
-    def __init__(self, truth_path: Path | None) -> None:
+    port: str
+
+    def __init__(self, physics: Physics, config: Emulation, truth_path: Path | None) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="sim2real-robot-")
         self.truth_path = Path(self._folder.name) / "truth.bin" if truth_path is None else truth_path
         self.clock: Clock = self
         self.reports: list[str] = []
         self.guardian_lives = self.host_lives = True
-        self._log: TruthLog
         self._now_ns = 0
         self._watchers: dict[threading.Event, list[Any]] = {}  # what is called, its period [ns], when it is due [ns]
         self._calling = False
         self._guard: Guard | None = None
+        self._log = TruthLog(self.truth_path, truth_header(physics, config, 0))
+        self.planned = self.make(physics, config, self._log)
+
+    @abstractmethod
+    def make(self, physics: Any, config: Any, log: TruthLog) -> PlannedRobot[Any]:
+        """Return the robot in planned time."""
 
     def __enter__(self) -> Self:
-        """Return the running robot."""
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """Stop it."""
         self.stop()
 
-    @abstractmethod
-    def _next_ns(self) -> int | None:
-        """Return the time of the robot's next event [ns]; None: there is none."""
-
-    @abstractmethod
-    def _advance(self, t_ns: int) -> None:
-        """Let the robot get to a time [ns], at or before its next event."""
+    def strike(self, **faults: Any) -> None:
+        """Let faults begin, or end, now; named as the fields of the settings."""
+        self.planned.config = replace(self.planned.config, **faults)
+        self.planned.begin_faults(self._now_ns)
 
     def stall(self, duration_s: float) -> None:
         """Stop the host's process for a time [s], with all its threads."""
@@ -91,10 +96,7 @@ class VirtualTime(ABC):
         self.stop()
         return read_truth(self.truth_path)
 
-    # -- the clock
-
     def now_ns(self) -> int:
-        """Return the virtual time [ns]."""
         return self._now_ns
 
     def sleep(self, duration_s: float) -> None:
@@ -127,9 +129,9 @@ class VirtualTime(ABC):
     def _pass(self, until_ns: int, arrived: Callable[[], object] = lambda: False) -> None:
         """Let time pass, event by event, to a time [ns] or until something has arrived."""
         while not arrived():
-            due_ns = min((t for t in (self._next_ns(), self._guard_due_ns()) if t is not None), default=until_ns)
-            self._now_ns = max(self._now_ns, min(due_ns, until_ns))
-            self._advance(self._now_ns)
+            due = (t for t in (self.planned.next_due_ns(), self._guard_due_ns()) if t is not None)
+            self._now_ns = max(self._now_ns, min(min(due, default=until_ns), until_ns))
+            self.planned.run_until(self._now_ns)
             guard_ns = self._guard_due_ns()
             if self._guard is not None and guard_ns is not None and guard_ns <= self._now_ns:
                 self._guard_acts(lambda guard: guard.look())
@@ -151,7 +153,7 @@ class VirtualTime(ABC):
 
 
 class VirtualChannel:
-    """The host's end of the connection to a guardian in virtual time; see `Channel`."""
+    """The host's end of the connection to a guardian in virtual time; a `Channel`."""
 
     pid = 0
 
@@ -164,13 +166,12 @@ class VirtualChannel:
         self._messages += message
 
     def send(self, message: bytes) -> None:
-        """Send a message, at which the guardian acts at once; OSError if it has died."""
         if not self._robot.guardian_lives:
             raise BrokenPipeError("the guardian has died")
         self._robot.guardian_hears(message)
 
     def receive(self, until_ns: int) -> bytes | None:
-        """Return messages; None if there are none: the guardian answers at once, or never; b"" if it has died."""
+        """Return messages; None if there are none: the guardian answers at once, or never."""
         del until_ns
         if not self._robot.guardian_lives:
             return b""
@@ -178,7 +179,6 @@ class VirtualChannel:
         return messages or None
 
     def close(self, wait_s: float) -> None:
-        """Close the connection."""
         if not wait_s:  # the host leaves without a word: as if it had died
             self._robot.guardian_hears(b"")
         self._robot.watch(None)
@@ -199,28 +199,22 @@ class VirtualRobot(VirtualTime):
         plant_args: Mapping[str, Any] | None = None,
         truth_path: Path | None = None,
     ) -> None:
-        super().__init__(truth_path)
         self.plant = load_plant(plant, dict(plant_args or {})) if isinstance(plant, str) else plant
-        self._log = TruthLog(self.truth_path, truth_header(self.plant, config, 0))
-        self._config = config
+        super().__init__(self.plant, config, truth_path)
         self._baud_rate: int | None = None  # None: no host has opened the port
         self._inbox: list[bytes] = []
-        self.bus: Any = type(config).bus_type(self.plant, config, self._log, self._take, 0, self.now_ns)
+        self.bus: Any = self.planned
         self.port = f"virtual:{next(NUMBERS)}"
         EMULATED[self.port] = self._open
 
-    def strike(self, **faults: Any) -> None:
-        """Let faults begin, or end, now; named as the fields of `Emulation`."""
-        self._config = replace(self._config, **faults)
-        self.bus._config = self.bus.config = self._config
-        self.bus.begin_faults(self._now_ns)
+    def make(self, physics: Plant, config: BusEmulation, log: TruthLog) -> PlannedRobot[Any]:
+        return config.bus_type(physics, config, log, self._take, 0, self.now_ns)
 
     def stop(self) -> None:
-        """End the robot, after which its truth is complete. May be called twice."""
         EMULATED.pop(self.port, None)
         super().stop()
 
-    # -- the port
+    # The port
 
     def _open(self, baud_rate: int) -> Port:
         if self._baud_rate is not None or self.bus.unplugged(self._now_ns):
@@ -229,33 +223,42 @@ class VirtualRobot(VirtualTime):
         return self
 
     def write(self, data: bytes) -> None:
-        """Send bytes to the servos; OSError if the port is gone."""
         self._require_port()
         if self._baud_rate == self.bus.baud_rate:
-            self._feed(data)
+            self.feed(data)
 
     def read(self, until_ns: int) -> bytes:
-        """Return the bytes that have arrived; none if there are none until a time [ns]; OSError if the port is gone."""
         self._require_port()
-        data = self._take_until(until_ns)
+        data = self.take_until(until_ns)
         self._require_port()
         return data
 
     def flush(self) -> None:
-        """Drop the bytes that have arrived; OSError if the port is gone."""
         self._require_port()
         self._inbox.clear()
 
     def close(self) -> None:
-        """Close the port."""
         self._baud_rate = None
         self._inbox.clear()
 
     def guardian(self, off: bytes, servos: Queries, silence_s: float, answer_s: float) -> Guardian:
-        """Return a guardian that acts in virtual time."""
         line = _GuardLine(self)
         motors = Motors(lambda: take_torque_off(line, off, servos, answer_s), self, CUT)
         return Guardian(lambda longest_s: VirtualChannel(self, motors, longest_s), silence_s)
+
+    def feed(self, data: bytes) -> None:
+        """Send bytes to the servos, whoever has the port."""
+        self._require_line()
+        self.bus.feed(data, self._now_ns)
+        self.bus.run_until(self._now_ns)
+
+    def take_until(self, until_ns: int) -> bytes:
+        """Return the bytes that have arrived; none if there are none until a time [ns]."""
+        self._pass(until_ns, lambda: self._inbox)
+        self._require_line()
+        data = b"".join(self._inbox)
+        self._inbox.clear()
+        return data
 
     def _require_port(self) -> None:
         if self._baud_rate is None or not self.host_lives:
@@ -266,38 +269,20 @@ class VirtualRobot(VirtualTime):
         if self.bus.unplugged(self._now_ns):
             raise OSError("the port is gone")
 
-    def _feed(self, data: bytes) -> None:
-        self._require_line()
-        self.bus.feed(data, self._now_ns)
-        self.bus.run_until(self._now_ns)
-
-    def _take_until(self, until_ns: int) -> bytes:
-        self._pass(until_ns, lambda: self._inbox)
-        self._require_line()
-        data = b"".join(self._inbox)
-        self._inbox.clear()
-        return data
-
     def _take(self, answer: bytes) -> bool:
         self._inbox.append(answer)
         return True
 
-    def _next_ns(self) -> int | None:
-        return self.bus.next_due_ns()
-
-    def _advance(self, t_ns: int) -> None:
-        self.bus.run_until(t_ns)
-
 
 class _GuardLine:
-    """The virtual port, as the guardian's own code uses it."""
+    """The port in virtual time, as the guardian's own code uses it; a `Line`."""
 
     def __init__(self, robot: VirtualRobot) -> None:
         self.clock: Clock = robot
         self._robot = robot
 
-    def write(self, packet: bytes) -> None:
-        self._robot._feed(packet)
+    def write(self, data: bytes) -> None:
+        self._robot.feed(data)
 
     def read(self, until_ns: int) -> bytes:
-        return self._robot._take_until(max(until_ns, self._robot.now_ns() + 1))  # time goes on
+        return self._robot.take_until(max(until_ns, self._robot.now_ns() + 1))  # time goes on

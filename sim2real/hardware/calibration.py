@@ -9,11 +9,13 @@ Its `drive_mode` 1 mirrors the joint. A turn has 4095 counts for LeRobot, 4096 h
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final
 
 import msgspec
+import numpy as np
 
 from sim2real.errors import HardwareLost, UsageError
 from sim2real.hardware import feetech as reg
@@ -21,7 +23,6 @@ from sim2real.hardware.bus.link import ServoLink
 from sim2real.hardware.bus.port import BusConfig
 from sim2real.hardware.bus.servos import ServoJoint
 from sim2real.hardware.feetech import StsServos
-from sim2real.hardware.hand_motion import HandMotion
 
 _HINT: Final = "lerobot-calibrate writes one"
 _SHARE_OF_TRAVEL: Final = (0.75, 1.3)
@@ -30,6 +31,20 @@ ranges are 0.81 to 1.27 of the description's travel, the most at grippers; those
 """
 _WHOLE_TURN: Final = 0.97
 """Share of a revolution from which on a range is called a whole turn."""
+_MOVED_RAD: Final = 0.3
+"""Motion of a joint by hand from which on it counts as moved [rad]."""
+_END_RAD: Final = 0.1
+"""Largest distance of a joint's stop from the end of its calibrated range [rad]; the zero, the middle of both, is
+then wrong by at most as much."""
+_MIDDLE_RAD: Final = 0.7
+"""Largest distance of a joint from its zero in the middle pose, which a person finds by eye [rad]."""
+_STILL_RAD, _STILL_S, _SETTLED_S = 0.05, 0.5, 1.0
+_PATIENCE_S: Final = 6.0
+"""How long all joints rest before a stop that was not reached counts as a finding [s]."""
+_POSED_S: Final = 3.0
+"""How long all joints rest in a wrong middle pose before it counts as a finding [s]."""
+_LEAST_OF_TRAVEL: Final = 0.75
+_CALIBRATE: Final = "calibrate again: begin with every joint in the middle, then move each from stop to stop"
 _PERIOD_S: Final = 0.02
 _LONGEST_S: Final = 600.0
 _CENTRE: Final = 2047
@@ -181,6 +196,186 @@ def _present(link: ServoLink, servo_id: int, name: str) -> ServoJoint:
     return ServoJoint(name, servo_id, low_count=low, high_count=high, homing_offset=offset)
 
 
+@dataclass(frozen=True)
+class Nudge:
+    """A small motion that a person makes with one joint.
+
+    Attributes:
+        words: The motion, as an instruction.
+        direction: Sign of the joint's angle in that direction.
+        travel_rad: Angle from stop to stop [rad]; None: the joint has no stops.
+    """
+
+    joint: str
+    words: str
+    direction: int
+    travel_rad: float | None
+
+
+class HandMotion:
+    """A person moves the joints by hand, with torque off: the middle pose, a nudge of each joint, all stops.
+
+    It follows the counts of the encoders, and finds which servo moves which joint, in which direction and how far.
+
+    Args:
+        joints: The robot's joints. Uncalibrated ones have a range of a whole turn and no homing offset.
+        nudges: The motions, in the order of the instructions.
+
+    Attributes:
+        instruction: The present instruction.
+        directions: Joint -> sign of its counts in the direction of its angle; complete after the nudges.
+        low: Lowest counts, unwrapped, ``(joints,)``.
+        high: Highest counts, unwrapped, ``(joints,)``.
+        middle: Counts in the middle pose, ``(joints,)``.
+    """
+
+    def __init__(self, joints: Sequence[ServoJoint], nudges: Sequence[Nudge], calibrated: bool) -> None:
+        self.joints, self.nudges, self.calibrated = joints, nudges, calibrated
+        self.directions: dict[str, int] = {}
+        self.low = self.high = self.middle = self._counts = self._anchor = self._first = np.zeros(0)
+        self._still_s = self._still_since_s = 0.0
+        self._place = {joint.name: i for i, joint in enumerate(joints)}
+        self._bounded = [nudge for nudge in nudges if nudge.travel_rad is not None]
+        self._steps = self._follow()
+        self.instruction = next(self._steps)
+
+    def feed(self, t_s: float, counts: np.ndarray) -> bool:
+        """Take the counts ``(joints,)`` at a time [s]; return whether the motion is complete.
+
+        Raises:
+            HardwareLost: The motion contradicts the calibration, or the assembly of the arm.
+        """
+        self._unwrap(t_s, counts)
+        if self.middle.size:
+            self.low, self.high = np.minimum(self.low, self._counts), np.maximum(self.high, self._counts)
+            self._require_within()
+        try:
+            self.instruction = next(self._steps)
+        except StopIteration:
+            return True
+        return False
+
+    def _follow(self) -> Iterator[str]:
+        """Yield the instruction after each measurement, until the motion is complete."""
+        middle = False
+        while not middle:
+            yield "hold the arm with every joint in the middle of its travel, and keep it still for a second"
+            middle = self._is_in_the_middle()
+        self.middle = self.low = self.high = self._counts
+        # A nudge begins at rest.
+        for nudge in self.nudges:
+            words = f"{nudge.joint}: {nudge.words}, then back"
+            yield words
+            while self._still_s < _STILL_S:
+                yield words
+            base = self._counts
+            while not self._is_nudged(nudge, base):
+                yield words
+        while lacking := [nudge for nudge in self._bounded if not self._has_been_at_both_stops(nudge)]:
+            self._require_reached(lacking)
+            yield f"move to both stops: {', '.join(nudge.joint for nudge in lacking)}"
+        while self._still_s < _SETTLED_S:
+            yield "move to both stops: done"
+
+    def _unwrap(self, t_s: float, counts: np.ndarray) -> None:
+        """Unwrap the counts at the encoder's seam, and note for how long all joints have rested."""
+        if not self._counts.size:
+            self._counts = self._anchor = self._first = counts.astype(np.float64)
+            self._still_since_s = t_s
+        half = reg.COUNTS_PER_REVOLUTION / 2
+        self._counts = self._counts + (counts - self._counts + half) % reg.COUNTS_PER_REVOLUTION - half
+        if np.any(np.abs(self._counts - self._anchor) * reg.RAD_PER_COUNT > _STILL_RAD):
+            self._anchor, self._still_since_s = self._counts, t_s
+        self._still_s = t_s - self._still_since_s
+
+    def _is_in_the_middle(self) -> bool:
+        """Whether the pose at rest is the middle: a calibrated arm's has angles near 0, another was moved before."""
+        if self._still_s < _SETTLED_S:
+            return False
+        moved = bool(np.any(np.abs(self._counts - self._first) * reg.RAD_PER_COUNT > _MOVED_RAD))
+        angles = {j.name: j.angle(count) for j, count in zip(self.joints, self._counts, strict=True)}
+        wrong = [n.joint for n in self._bounded if abs(angles[n.joint]) > _MIDDLE_RAD]
+        wrong.sort(key=self._place.__getitem__)
+        # An arm that was not moved yet lies where it was put away.
+        if not moved and (wrong or not self.calibrated):
+            return False
+        if not self.calibrated or not wrong:
+            return True
+        if self._still_s < _POSED_S:
+            return False
+        there = ", ".join(f"{name} {math.degrees(angles[name]):.0f} degrees" for name in wrong)
+        raise HardwareLost(
+            f"in the middle pose these joints should be near 0 degrees, and are at: {there}",
+            hint=f"hold the arm in the middle pose and start again; if it was there, {_CALIBRATE}",
+        )
+
+    def _is_nudged(self, nudge: Nudge, base: np.ndarray) -> bool:
+        """Whether the joint of the instruction has moved; note its direction."""
+        moved = (self._counts - base) * reg.RAD_PER_COUNT
+        # A joint that was nudged before is identified: its motion decides nothing.
+        far = [j for i, j in enumerate(self.joints) if j.name not in self.directions and abs(moved[i]) > _MOVED_RAD]
+        if not far:
+            return False
+        if len(far) > 1:
+            both = " and ".join(joint.name for joint in far)
+            raise HardwareLost(f"{both} moved together", hint="start again, and move one joint at a time")
+        (joint,) = far
+        if joint.name != nudge.joint:
+            raise HardwareLost(
+                f"{nudge.joint} was to be moved, but servo {joint.servo_id}, {joint.name}, turned",
+                hint="two servos have exchanged ids, or another joint was moved: lerobot-setup-motors sets ids",
+            )
+        sign = int(np.sign(moved[self._place[joint.name]]))
+        if self.calibrated and sign * joint.direction != nudge.direction:
+            raise HardwareLost(
+                f"{nudge.joint} turned in the other direction than '{nudge.words}': by the calibration its angle "
+                f"{'fell' if nudge.direction > 0 else 'rose'}",
+                hint="its servo is mounted turned, or drive_mode of the calibration is wrong",
+            )
+        self.directions[nudge.joint] = sign * nudge.direction
+        return True
+
+    def _require_within(self) -> None:
+        """Refuse a joint that turns beyond its calibrated range."""
+        for nudge in self._bounded if self.calibrated else []:
+            low, high = self._ends(nudge)
+            beyond = -min(self._short_of(nudge))
+            if beyond > _END_RAD:
+                seam = low < 0 or high >= reg.COUNTS_PER_REVOLUTION
+                raise HardwareLost(
+                    f"{nudge.joint} turns at least {math.degrees(beyond):.0f} degrees beyond its calibrated range"
+                    f"{', across the seam between counts 4095 and 0' if seam else ''}: its zero is wrong",
+                    hint=_CALIBRATE,
+                )
+
+    def _require_reached(self, lacking: Sequence[Nudge]) -> None:
+        """Refuse a joint that was moved to its stops, rests, and yet is short of its calibrated range."""
+        for nudge in lacking if self.calibrated and self._still_s > _PATIENCE_S else []:
+            if self._share(nudge) >= _LEAST_OF_TRAVEL:
+                raise HardwareLost(
+                    f"{nudge.joint} stops {math.degrees(max(self._short_of(nudge))):.0f} degrees before the end of its "
+                    "calibrated range: its zero is wrong, or it did not reach its stop",
+                    hint=f"start again; if it was at both stops, {_CALIBRATE}",
+                )
+
+    def _has_been_at_both_stops(self, nudge: Nudge) -> bool:
+        return max(self._short_of(nudge)) <= _END_RAD if self.calibrated else self._share(nudge) >= _LEAST_OF_TRAVEL
+
+    def _ends(self, nudge: Nudge) -> tuple[float, float]:
+        i = self._place[nudge.joint]
+        return float(self.low[i]), float(self.high[i])
+
+    def _short_of(self, nudge: Nudge) -> tuple[float, float]:
+        """Return the distances of the lowest and the highest count from the calibrated ends [rad]."""
+        joint, (low, high) = self.joints[self._place[nudge.joint]], self._ends(nudge)
+        return (low - joint.low_count) * reg.RAD_PER_COUNT, (joint.high_count - high) * reg.RAD_PER_COUNT
+
+    def _share(self, nudge: Nudge) -> float:
+        """Return which share of its travel a joint has moved through."""
+        low, high = self._ends(nudge)
+        return (high - low) * reg.RAD_PER_COUNT / (nudge.travel_rad or math.inf)
+
+
 def follow(servos: StsServos, motion: HandMotion, show: Callable[[str], None]) -> None:
     """Read the open servos, without torque, until the motion is complete.
 
@@ -209,7 +404,7 @@ def write_calibration(servos: StsServos, motion: HandMotion, path: Path) -> None
     A servo's count is 2047 in the middle of its joint's travel; of a joint without stops in the middle pose.
     """
     link, entries = servos.link, {}
-    bounded = {n.joint for n in motion.nudges if n.travel_rad is not None}
+    bounded = {nudge.joint for nudge in motion.nudges if nudge.travel_rad is not None}
     for i, joint in enumerate(motion.joints):
         # The encoder's count is that of the register and the offset together.
         old = link.read(joint.servo_id, reg.HOMING_OFFSET)

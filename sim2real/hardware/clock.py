@@ -31,11 +31,9 @@ class SystemClock:
     """CLOCK_MONOTONIC; what it repeats runs in a thread of its own."""
 
     def now_ns(self) -> int:
-        """Return the time [ns]."""
         return time.monotonic_ns()
 
     def sleep(self, duration_s: float) -> None:
-        """Return after a time [s]."""
         time.sleep(duration_s)
 
     def repeat(self, call: Callable[[], None], period_s: float, done: threading.Event, name: str) -> None:

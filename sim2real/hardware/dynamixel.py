@@ -234,7 +234,6 @@ class VoltageDrive(Drive):
         return self.supply_v * GOAL_PWM.unit
 
     def registers(self) -> dict[Register, int]:
-        """Return none."""
         return {}
 
     def joints_of(self, ids: Sequence[int]) -> tuple[ServoJoint, ...]:
@@ -276,7 +275,6 @@ class PositionDrive(Drive):
         return self.profile_velocity_rad_s
 
     def registers(self) -> dict[Register, int]:
-        """Return gains and profile, which a servo loses without power."""
         if not self.profile_velocity_rad_s > 0.0:
             raise UsageError(
                 f"position drive: profile_velocity_rad_s = {self.profile_velocity_rad_s} must be larger than 0",

@@ -15,7 +15,6 @@ assumptions.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import IntEnum
 from itertools import combinations
 from typing import Final
 
@@ -51,7 +50,6 @@ class StsProtocol(PacketFormat):
     off_errors = tuple(sum(1 << bit for bit in on) for n in range(len(ALARMS) + 1) for on in combinations(ALARMS, n))
 
     def frame(self, servo_id: int, body: bytes) -> bytes:
-        """Return the bytes of a packet with a body of at most 252 bytes."""
         summed = bytes((servo_id, len(body) + 1)) + body
         return HEADER + summed + bytes((checksum(summed),))
 
@@ -70,10 +68,8 @@ PROTOCOL: Final = StsProtocol()
 
 COUNTS_PER_REVOLUTION: Final = 4096
 RAD_PER_COUNT: Final = 2.0 * math.pi / COUNTS_PER_REVOLUTION
-ACCELERATION_UNIT: Final = 100  # counts/s^2; 8.7 deg/s^2 in the table
 DUTY_PER_RAD_AND_GAIN: Final = 0.166  # duty for a radian of error and a P gain of 1: measured by Rhoban (BAM, STS3215)
 LOAD_FULL_SCALE: Final = 1000  # load and torque registers count in units of 0.1 %
-CURRENT_UNIT_A: Final = 0.0065
 FASTEST_COUNTS_PER_S: Final = 3400
 """Speed of the setpoint at power-up, measured by Rhoban (BAM): about the motor's speed without load."""
 BAUD_RATES: Final = (1_000_000, 500_000, 250_000, 128_000, 115_200, 76_800, 57_600, 38_400)
@@ -83,15 +79,6 @@ BAUD_RATES: Final = (1_000_000, 500_000, 250_000, 128_000, 115_200, 76_800, 57_6
 PHASE_COUNTS_PER_S: Final = 0x04  # speeds are in counts/s; if not set, in units of 0.732 rpm, which are 50 counts/s
 PHASE_ZERO_IS_FASTEST: Final = 0x08  # Goal Speed 0 means top speed; if not set, stop
 PHASE_FULL_ANGLE: Final = 0x10  # positions count turns; if not set, they wrap from 4095 to 0
-
-
-class Mode(IntEnum):
-    """Values of the register Operating Mode."""
-
-    POSITION = 0
-    VELOCITY = 1
-    PWM = 2
-    STEP = 3
 
 
 FIRMWARE_MAJOR = Register("firmware_major", 0, 1, default=3, eeprom=True)
@@ -121,7 +108,7 @@ PROTECTIVE_TORQUE = eeprom("protective_torque", 34, 1, 0, 254, 20)
 PROTECTION_TIME = eeprom("protection_time", 35, 1, 0, 254, 200)
 OVERLOAD_TORQUE = eeprom("overload_torque", 36, 1, 0, 254, 80)
 TORQUE_ENABLE = ram("torque_enable", 40, 1, 0, 1, 0)  # 2: damping, 128: this is the centre; neither is used here
-ACCELERATION = ram("acceleration", 41, 1, 0, 254, 0, unit=ACCELERATION_UNIT * RAD_PER_COUNT)
+ACCELERATION = ram("acceleration", 41, 1, 0, 254, 0)  # 0: no limit
 GOAL_POSITION = ram("goal_position", 42, 2, -32767, 32767, 0, sign=15, unit=RAD_PER_COUNT)
 GOAL_TIME = ram("goal_time", 44, 2, -1000, 1000, 0, sign=10)  # in PWM mode the duty, in position mode unused
 GOAL_SPEED = ram("goal_speed", 46, 2, -32767, 32767, FASTEST_COUNTS_PER_S, sign=15)
@@ -132,10 +119,7 @@ PRESENT_SPEED = Register("present_speed", 58, 2, sign=15, unit=RAD_PER_COUNT)
 PRESENT_LOAD = Register("present_load", 60, 2, sign=10, unit=1 / LOAD_FULL_SCALE)
 PRESENT_VOLTAGE = Register("present_voltage", 62, 1, default=120)
 PRESENT_TEMPERATURE = Register("present_temperature", 63, 1, default=30)
-ASYNC_WRITE = Register("async_write", 64, 1)
 STATUS = Register("status", 65, 1)
-MOVING = Register("moving", 66, 1)
-PRESENT_CURRENT = Register("present_current", 69, 2, sign=15, unit=CURRENT_UNIT_A)
 
 _SOURCE: Final = "Feetech, STS Series Servo Memory Table: no register for it; not measured by us"
 MODELS: Final = {777: ServoModel("STS3215", None, _SOURCE), 2825: ServoModel("STS3250", None, _SOURCE)}
@@ -183,7 +167,6 @@ class StsDrive(Drive):
     Args:
         p_gain: P gain; LeRobot uses 16.
         speed_rad_s: Speed at which a servo's setpoint moves to its goal; inf: the setpoint is the goal.
-        acceleration_rad_s2: Acceleration of the setpoint, rounded to a multiple of 0.15 rad/s^2; inf: no limit.
         torque: Largest fraction of a servo's torque, in (0, 1].
         joints: The joints, e.g. from `read_calibration`; a servo without one gets a joint with its zero at 2048 counts.
     """
@@ -192,23 +175,20 @@ class StsDrive(Drive):
     d_gain: int = 32
     i_gain: int = 0
     speed_rad_s: float = math.inf
-    acceleration_rad_s2: float = math.inf
     torque: float = 1.0
     joints: tuple[ServoJoint, ...] = ()
-    mode = int(Mode.POSITION)
+    mode = 0  # follow a position
     goal = GOAL_POSITION
 
     def __post_init__(self) -> None:
-        for name in ("speed_rad_s", "acceleration_rad_s2"):
-            if not getattr(self, name) > 0.0:
-                raise UsageError(f"{name} = {getattr(self, name)} must be larger than 0", hint="inf: no limit")
+        if not self.speed_rad_s > 0.0:
+            raise UsageError(f"speed_rad_s = {self.speed_rad_s} must be larger than 0", hint="inf: no limit")
         if not 0.0 < self.torque <= 1.0:
             raise UsageError(f"torque = {self.torque} is not a fraction in (0, 1]")
         within(self.registers())
 
     def registers(self, phase: int = PHASE.default) -> dict[Register, int]:
         """Return the registers' values [counts] for a servo whose register Phase holds `phase`."""
-        acceleration = self.acceleration_rad_s2 / ACCELERATION.unit
         # Goal Speed 0 means "stop" for some servos: the smallest value is 1, and the largest their top speed.
         fastest = 0 if phase & PHASE_ZERO_IS_FASTEST else FASTEST_COUNTS_PER_S
         speed = self.speed_rad_s / speed_unit_rad_s(phase)
@@ -216,7 +196,7 @@ class StsDrive(Drive):
             P_GAIN: self.p_gain,
             D_GAIN: self.d_gain,
             I_GAIN: self.i_gain,
-            ACCELERATION: 0 if acceleration > ACCELERATION.maximum else max(1, round(acceleration)),
+            ACCELERATION: 0,  # no limit
             GOAL_SPEED: fastest if speed > GOAL_SPEED.maximum else max(1, round(speed)),
             TORQUE_LIMIT: TORQUE_LIMIT.count(self.torque),
         }
@@ -261,11 +241,9 @@ class StsServos(Servos):
         self._phases[servo_id] = link.read(servo_id, PHASE)
 
     def settings(self, servo_id: int) -> dict[Register, int]:
-        """Return the registers of the drive, speeds in the servo's own unit."""
         return self._sts.registers(self._phases[servo_id])
 
     def speed_unit(self, servo_id: int) -> float:
-        """Return the servo's own unit of speed [rad/s]."""
         return speed_unit_rad_s(self._phases[servo_id])
 
 

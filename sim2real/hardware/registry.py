@@ -1,16 +1,39 @@
-"""Devices by name: those of sim2real, and those of installed packages."""
+"""Devices and worlds by name: those of sim2real, and those of installed packages; to list them imports no module."""
+
+from __future__ import annotations
 
 import importlib
 import importlib.util
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from importlib import metadata
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, Final, Protocol, cast
 
 from sim2real.errors import UsageError
-from sim2real.hardware.device import Device
-from sim2real.hardware.entries import DEVICES, available
+
+if TYPE_CHECKING:
+    from sim2real.hardware.device import Device
+
+DEVICES: Final = "sim2real.devices"
+"""The entry point group of devices, see `DeviceFactory`."""
+WORLDS: Final = "sim2real.worlds"
+"""The entry point group of worlds, see `sim2real.robots.robot`."""
+BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = {
+    DEVICES: {
+        "dynamixel": "sim2real.hardware.dynamixel:servos",
+        "feetech": "sim2real.hardware.feetech:servos",
+        "unitree": "sim2real.hardware.unitree.device:legs",
+    },
+    WORLDS: {},
+}
+"""Group -> name -> ``module:callable`` of the devices and worlds of sim2real."""
+
+
+def available(group: str = DEVICES) -> dict[str, Any]:
+    """Return name -> source of a group; an installed package replaces the built-in entry of the same name."""
+    return {**BUILT_IN[group], **{entry.name: entry for entry in metadata.entry_points(group=group)}}
 
 
 class DeviceFactory(Protocol):

@@ -618,8 +618,7 @@ def in_world(robot: AnyRobot, name: str | None) -> AnyRobot:
     """
     if name is None:
         return robot
-    from sim2real.hardware.entries import WORLDS
-    from sim2real.hardware.registry import load_entry
+    from sim2real.hardware.registry import WORLDS, load_entry
 
     model = load_entry("world", name, WORLDS, "robots.robot.RobotModel")(robot)
     if not isinstance(model, RobotModel):

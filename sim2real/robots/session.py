@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, Self
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
-    from sim2real.emulation.process import EmbeddedRobot, Emulated
+    from sim2real.emulation.process import EmbeddedRobot
+    from sim2real.emulation.robot import Emulation
     from sim2real.hardware.device import Device
     from sim2real.hardware.joint import Joint
     from sim2real.hardware.safety.gate import GateConfig
@@ -28,7 +29,7 @@ class Embedded:
     """
 
     plant: str
-    emulator: Emulated
+    emulator: Emulation
     plant_args: Mapping[str, Any] = field(default_factory=dict)
 
     def mounted(self, joints: Sequence[Joint], zero_rad: float) -> Embedded:

@@ -94,18 +94,6 @@ def standing(kp=40.0):
     return np.tile([0.0, 0.0, kp, 1.0, 0.0], (N, 1))
 
 
-def test_a_stale_command_damps_and_does_not_go_limp():
-    device = Legs()
-    with Rig(device, gate(command_timeout_s=0.05)) as rig:
-        rig.start()
-        rig.command(standing(), 0.0, 1e-9 * rig.clock.now_ns())
-        end = 1e-9 * rig.clock.now_ns() + 5.0
-        while rig.timeouts == 0 and 1e-9 * rig.clock.now_ns() < end:
-            rig.clock.sleep(0.01)
-        assert rig.timeouts
-    np.testing.assert_array_equal(device.heard[-1][:, 1:], np.tile([0.0, 0.0, DAMPING, 0.0], (N, 1)))
-
-
 def test_a_soft_stop_is_the_device_s_own():
     device = Legs()
     with Rig(device, gate()) as rig:
@@ -149,17 +137,6 @@ def test_a_part_that_is_not_possible_stops_the_rig():
         device.quaternion = np.zeros(4)
         with pytest.raises(SafetyStop, match="'quaternion' of the reading has the norm 0"):
             rig.measure()
-
-
-def test_a_gate_beyond_the_reach_of_a_column_is_refused():
-    high = HIGH.copy()
-    high[1, 2] = 200.0
-    with pytest.raises(UsageError, match="exceeds the reach"):
-        Rig(Legs(), GateConfig((LOW.tolist(), high.tolist()), stale=Legs.commanded.stale))
-
-
-def test_the_reaction_without_a_host_is_a_sentence():
-    assert str(Legs().without_host()[0]) == "leg (FR_hip, FL_hip) damps its joint after 0.5 s"
 
 
 @struct.dataclass

@@ -1,5 +1,6 @@
 """An emulated robot's plant, its settings, and its account of what was true."""
 
+import json
 import subprocess
 import sys
 import threading
@@ -47,7 +48,8 @@ def test_an_emulator_needs_neither_jax_nor_mujoco():
 )
 def test_an_emulation_that_is_none_says_so(capsys, name, message):
     module = "sim2real.emulation.plant" if name == "Plant" else "sim2real.emulation.dynamixel"
-    assert emulator.main(["--emulation", f"{module}:{name}", "--plant", f"{PLANTS}:Ramp", "--truth", "t.bin"]) == 2
+    task = {"emulation": f"{module}:{name}", "plant": f"{PLANTS}:Ramp", "truth": "t.bin"}
+    assert emulator.main([json.dumps(task)]) == 2
     assert message in capsys.readouterr().err
 
 

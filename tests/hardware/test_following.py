@@ -10,8 +10,6 @@ from hypothesis import strategies as st
 
 from sim2real.errors import SafetyStop
 from sim2real.hardware.safety.following import Following, FollowingCheck
-from sim2real.hardware.safety.gate import GateConfig
-from sim2real.hardware.safety.plausibility import Plausibility
 
 GATE = {"limit": 1.5, "slew_per_s": 20.0}
 START = np.array([0.5, -0.8, 0.3])
@@ -164,11 +162,3 @@ def test_each_sender_begins_near_the_measured_pose():
         with pytest.raises(SafetyStop):
             rig.command(START - 0.6, 0.0, 0.04)
     robot.stop()
-
-
-def test_nan_of_one_joint_hides_no_other_joint():
-    check = Plausibility(GateConfig(envelope_rad=(-1.0, 1.0), joints=("pan", "lift")))
-    with pytest.raises(SafetyStop, match=r"'lift'.*envelope"):
-        check.check(np.array([np.nan, 5.0]), 0.0, 0.0, np.zeros(2, bool))
-    with pytest.raises(SafetyStop, match="'pan'"):
-        check.check(np.array([np.nan, 0.5]), 0.0, 0.0, np.zeros(2, bool))

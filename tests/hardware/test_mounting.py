@@ -261,3 +261,19 @@ def test_a_mounted_plant_is_seen_through_its_encoders():
     assert (plant.state(), plant.truth()) == ({"q": 1.0}, {"friction": 3.0})
     with pytest.raises(UsageError, match="1 joints are mounted on 2 servos"):
         MountedPlant(f"{__file__}:Flywheels", {"start": start}, joints[:1], centre)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [({"direction": 0}, "neither 1 nor -1"), ({"gear": -2.0}, "not a number above 0"), ({"gear": 0.0}, "above 0"),
+     ({"zero_rad": float("nan")}, "not a finite angle")],
+)  # fmt: skip
+def test_what_cannot_be_converted_is_refused(wrong, said):
+    with pytest.raises(UsageError, match=f"joint 'elbow'.*{said}"):
+        Joint("elbow", **wrong)
+
+
+def test_a_name_stands_for_a_joint_that_turns_with_its_encoder():
+    assert Joint.of("hinge") == Joint("hinge", 0.0, 1, 1.0)
+    assert Joint.of("hinge").is_plain
+    assert not any(joint.is_plain for joint in (Joint("a", gear=2.0), Joint("a", 0.1), Joint("a", direction=-1)))

@@ -95,13 +95,6 @@ def test_waiting_until_still(open_rig):
         rig.wait_until_still(0.02)
 
 
-def test_a_bus_that_cannot_be_set_up_is_closed(start_robot):
-    robot = start_robot("FirstOrder")
-    with pytest.raises(HardwareLost, match=r"servo 7.* does not answer"):
-        Rig(DynamixelServos(BusConfig(robot.port), [7], VoltageDrive(SUPPLY_V)), GateConfig())
-    Rig(DynamixelServos(BusConfig(robot.port), [1], VoltageDrive(SUPPLY_V)), GateConfig()).close()
-
-
 def test_a_soft_stop_fades_the_voltage_before_the_torque_goes_off(open_rig):
     rig, robot = open_rig(stop_s=0.5)
     rig.start()

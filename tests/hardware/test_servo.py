@@ -58,14 +58,6 @@ def test_a_write_of_several_registers_is_all_or_nothing(servo):
     assert servo.get(reg.LED) == 1
 
 
-def test_homing_offset_shifts_present_and_goal_alike(servo):
-    write(servo, reg.HOMING_OFFSET, 100)
-    servo.refresh(1.0, 0.0, 0.0, 0)
-    assert servo.get(reg.PRESENT_POSITION) == reg.GOAL_POSITION.count(1.0) + 100
-    in_mode(servo, OperatingMode.POSITION)
-    assert servo.command()[1] == pytest.approx(1.0, abs=reg.RAD_PER_COUNT)
-
-
 def test_present_registers():
     servo = in_mode(EmulatedServo(1, encoder_counts=1024), OperatingMode.PWM)
     write(servo, reg.GOAL_PWM, 442)
@@ -77,24 +69,6 @@ def test_present_registers():
     assert servo.get(reg.PRESENT_PWM) == 442
     assert servo.get(reg.MOVING) == 1
     assert servo.get(reg.REALTIME_TICK) == 40_000 - 32_768
-
-
-def test_overload_takes_torque_off_until_reboot(servo):
-    in_mode(servo, OperatingMode.PWM)
-    servo.overload()
-    assert servo.alert == 0x80
-    assert write(servo, reg.TORQUE_ENABLE, 1) == StatusError.RESULT_FAIL
-    servo.reboot()
-    assert servo.alert == 0
-    assert write(servo, reg.TORQUE_ENABLE, 1) == StatusError.NONE
-
-
-def test_action_needs_a_registered_write(servo):
-    assert servo.action() == (StatusError.INSTRUCTION, False)
-    servo.register_write(reg.LED.address, b"\x01")
-    assert servo.get(reg.LED) == 0
-    assert servo.action()[0] == StatusError.NONE
-    assert servo.get(reg.LED) == 1
 
 
 OK, OFF = StatusError.NONE, (OperatingMode.OFF, 0.0)
@@ -153,11 +127,3 @@ def test_a_watchdog_that_has_tripped_refuses_goals(model, stops, fraction, off_b
     assert servo.command() == ((PWM, 0.0) if off_by is reg.BUS_WATCHDOG else OFF)
     if off_by is reg.BUS_WATCHDOG:
         assert write(servo, reg.GOAL_PWM, 300) == OK
-
-
-def test_reboot_keeps_eeprom_only_and_no_read_goes_past_the_table(servo):
-    write(servo, reg.RETURN_DELAY_TIME, 0)
-    write(servo, reg.LED, 1)
-    servo.reboot()
-    assert (servo.get(reg.RETURN_DELAY_TIME), servo.get(reg.LED)) == (0, 0)
-    assert servo.read(140, 100) == (StatusError.ACCESS, b"")

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 from families import PLANTS
 
-from sim2real.emulation.bus import BusEmulation, InstructedBus
+from sim2real.emulation.bus import BusEmulation
 from sim2real.emulation.conformance import DeviceConformance
-from sim2real.emulation.firmware import ServoFirmware
+from sim2real.emulation.servos import ServoBus, ServoFirmware
 from sim2real.hardware import feetech
 from sim2real.hardware.bus.port import BusConfig
 from sim2real.hardware.bus.registers import Family, Register, ServoModel, eeprom, ram
@@ -47,11 +47,11 @@ class AcmeFirmware(ServoFirmware):
     family = FAMILY
 
 
-class AcmeBus(InstructedBus[AcmeFirmware, "AcmeEmulation"]):
+class AcmeBus(ServoBus[AcmeFirmware, "AcmeEmulation"]):
     family, wild_counts = FAMILY, (8192, 32767)
 
-    def make_servo(self, servo_id):
-        return AcmeFirmware(servo_id, 7, self.config.return_delay_us)
+    def make_servo(self, servo_id, config):
+        return AcmeFirmware(servo_id, 7, config.return_delay_us)
 
 
 class AcmeEmulation(BusEmulation):

@@ -7,7 +7,6 @@ from families import ANGLES, VOLTS
 from sim2real.emulation.truth import Kind
 from sim2real.errors import UsageError
 from sim2real.hardware import dynamixel as reg
-from sim2real.hardware.bus.packets import Instruction
 
 START_RAD = np.array([0.5, -0.8, 0.3])
 
@@ -28,27 +27,6 @@ def test_positions_start_where_the_joints_are_and_pass_the_gate():
         rig.stop()
     robot.stop()
     assert robot.truth().of(Kind.EFFECT).size == 0
-
-
-def test_no_instruction_writes_torque_or_a_goal(monkeypatch):
-    robot, written = VOLTS.robot(), []
-    execute = type(robot.bus).execute
-
-    def seen(self, request):
-        if request.packet.code in (Instruction.WRITE, Instruction.SYNC_WRITE):
-            written.append((self.form.word(request.packet.parameters, 0), request.packet.parameters[-1]))
-        execute(self, request)
-
-    with VOLTS.rig(robot) as rig:
-        rig.withhold_torque()
-        monkeypatch.setattr(type(robot.bus), "execute", seen)
-        rig.start()
-        for _ in range(20):
-            rig.command(np.full(3, 2.0), 0.0, 1e-9 * rig.clock.now_ns())
-            rig.measure()
-        rig.stop()
-    assert all(address == reg.TORQUE_ENABLE.address and value == 0 for address, value in written if value)
-    assert not any(address == reg.GOAL_PWM.address for address, _ in written)
 
 
 def test_torque_that_is_on_cannot_be_withheld():

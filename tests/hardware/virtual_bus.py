@@ -1,8 +1,8 @@
 from functools import cached_property
 from pathlib import Path
 
-from sim2real.emulation.faults import truth_header
 from sim2real.emulation.plant import load_plant
+from sim2real.emulation.robot import Emulation, PlannedRobot, truth_header
 from sim2real.emulation.truth import TruthLog, read_truth
 from sim2real.emulation.virtual import VirtualTime
 from sim2real.hardware.device import Device
@@ -54,16 +54,28 @@ class VirtualBus:
         return read_truth(self._path)
 
 
+class Idle(PlannedRobot):
+    def next_due_ns(self):
+        return None
+
+    def run_until(self, t_ns): ...
+
+
+class Nothing:
+    def state(self):
+        return {}
+
+    truth = state
+
+
 class IdleTime(VirtualTime):
     """Virtual time in which nothing happens by itself."""
 
     def __init__(self):
-        super().__init__(None)
+        super().__init__(Nothing(), Emulation(), None)
 
-    def _next_ns(self):
-        return None
-
-    def _advance(self, t_ns): ...
+    def make(self, physics, config, log):
+        return Idle(config, log, 0)
 
 
 class IdleDevice(Device):

@@ -10,7 +10,7 @@ from wrong_arms import RAD_PER_COUNT, ZERO_COUNTS, WrongArm
 
 from sim2real.errors import HardwareLost
 from sim2real.hardware.bus.servos import ServoJoint
-from sim2real.hardware.hand_motion import HandMotion
+from sim2real.hardware.calibration import HandMotion
 
 PERIOD_S, PATIENCE_S, OFFSET = 0.02, 8.0, 85
 

@@ -17,9 +17,9 @@ def lone_robot(tmp_path):
     """Start an emulated pendulum that does not end with its host; returns its port, and how to stop it."""
     embedded = load_robot("pendulum").drive.embedded
     path = tmp_path / "truth.bin"
-    command = [sys.executable, "-m", "sim2real.emulation.process", "--plant", embedded.plant]
-    command += ["--emulation", "sim2real.emulation.dynamixel:EmulatorConfig", "--truth", str(path)]
-    command += [f"--{n.replace('_', '-')}={v!r}" for n, v in asdict(embedded.emulator).items() if v is not None]
+    task = {"emulation": "sim2real.emulation.dynamixel:EmulatorConfig", "settings": asdict(embedded.emulator)}
+    task |= {"plant": embedded.plant, "truth": str(path)}
+    command = [sys.executable, "-m", "sim2real.emulation.process", json.dumps(task)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     port = json.loads(process.stdout.readline())["port"]

@@ -32,8 +32,8 @@ def record(
     """
     from dataclasses import replace
 
-    from sim2real.emulation.faults import truth_header
     from sim2real.emulation.legs import EmulatedLegs, UnitreeEmulation
+    from sim2real.emulation.robot import truth_header
     from sim2real.emulation.truth import TruthLog
     from sim2real.hardware.registry import load_named
     from sim2real.robots.servo.servos import approached

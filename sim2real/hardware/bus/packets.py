@@ -20,13 +20,10 @@ class Instruction(IntEnum):
     PING = 0x01
     READ = 0x02
     WRITE = 0x03
-    REG_WRITE = 0x04
-    ACTION = 0x05
     REBOOT = 0x08
     STATUS = 0x55
     SYNC_READ = 0x82
     SYNC_WRITE = 0x83
-    BULK_READ = 0x92
 
 
 @dataclass(frozen=True)

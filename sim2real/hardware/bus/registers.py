@@ -155,12 +155,3 @@ class Family:
     def moves(self, register: Register, values: Iterable[int]) -> bool:
         """Return whether a write could move a motor, or switch its torque on."""
         return register in self.goals or (register == self.torque and any(values))
-
-
-def reaction_table(models: Iterable[ServoModel]) -> str:
-    """Return the Markdown table of models and their reactions in docs/guides/safety.md."""
-    rows = [
-        (m.name, m.without_host(0.1).words.replace("after 0.1 s", "after `servo_watchdog_s`"), m.source) for m in models
-    ]
-    lines = [("Servo", "Reaction when the computer dies", "Source"), ("---",) * 3, *rows]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)

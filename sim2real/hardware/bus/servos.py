@@ -28,14 +28,13 @@ _BEYOND_RAD: Final = 0.1
 
 @dataclass(frozen=True)
 class ServoJoint:
-    """A joint that a servo moves: angle = direction * gear * (count - zero_count) * 2 pi / counts.
+    """A joint that a servo moves: angle = direction * (count - zero_count) * 2 pi / counts.
 
     Args:
         zero_count: The servo's count at the joint's zero [counts].
         direction: 1, or -1 if the joint's angle falls as the count rises.
         low_count: Lowest count of the joint's range; the servo's own limits may narrow it.
         high_count: Highest count.
-        gear: Turns of the joint per turn of the servo [1].
         homing_offset: Offset in the servo for which a calibration holds, checked at `open`, as are the servo's limits;
             None: there is no calibration.
         counts: Counts of a revolution.
@@ -47,15 +46,12 @@ class ServoJoint:
     direction: int = 1
     low_count: int = 0
     high_count: int = 4095
-    gear: float = 1.0
     homing_offset: int | None = None
     counts: int = 4096
 
     def __post_init__(self) -> None:
         if self.direction not in (1, -1):
             raise UsageError(f"joint {self.name!r}: direction = {self.direction} is neither 1 nor -1")
-        if not 0.0 < self.gear < math.inf:
-            raise UsageError(f"joint {self.name!r}: gear = {self.gear} must be larger than 0")
         if not 0 <= self.low_count < self.high_count < self.counts:
             raise UsageError(
                 f"joint {self.name!r}: {self.low_count} to {self.high_count} counts is not a range within 0 to "
@@ -65,7 +61,7 @@ class ServoJoint:
     @property
     def rad_per_count(self) -> float:
         """Change of the angle with the count [rad]."""
-        return self.direction * self.gear * 2.0 * math.pi / self.counts
+        return self.direction * 2.0 * math.pi / self.counts
 
     @property
     def range_rad(self) -> tuple[float, float]:
@@ -176,8 +172,8 @@ class Servos(Device):
         self._state = sorted(state, key=lambda register: register.address)
         self._of_state = [self._state.index(register) for register in state]
         sign = np.array([joint.direction for joint in joints_])
-        self._turns, self._load = sign * np.array([joint.gear for joint in joints_]), sign * family.load.unit
-        self._speed = self._turns * family.velocity.unit
+        self._sign, self._load = sign, sign * family.load.unit
+        self._speed = sign * family.velocity.unit
 
     # -- what differs between families
 
@@ -210,7 +206,6 @@ class Servos(Device):
 
     @property
     def commanded(self) -> CommandKind:
-        """The quantity of the drive's commands."""
         return self.drive.kind
 
     @property
@@ -222,22 +217,18 @@ class Servos(Device):
 
     @property
     def motors(self) -> tuple[str, ...]:
-        """Names of the servos."""
         return tuple(f"servo {i}" for i in self.ids)
 
     @property
     def clock(self) -> Clock:
-        """The clock of the port; before it is open, the machine's."""
         return SYSTEM_CLOCK if self._link is None else self._link.clock
 
     @property
     def silence_s(self) -> float:
-        """Longest time without an instruction while torque is on [s]; 0: unlimited."""
         return self.config.silence_s
 
     @property
     def counters(self) -> Counters:
-        """Counts of the transactions since `open`."""
         return Counters() if self._link is None else self._link.counters
 
     @property
@@ -273,20 +264,18 @@ class Servos(Device):
                 self.prepare(joint)
                 self._write(joint.servo_id, self.settings(joint.servo_id))
                 self._narrow(joint)
-            self._speed = self._turns * np.array([self.speed_unit(i) for i in self.ids])
+            self._speed = self._sign * np.array([self.speed_unit(i) for i in self.ids])
         except BaseException:
             self.close()
             raise
 
     def without_host(self) -> tuple[WithoutHost, ...]:
-        """Return the reaction of each model on this bus to the death of this process."""
         kinds: dict[ServoModel, list[str]] = {}
         for servo_id, model in self.models.items():
             kinds.setdefault(model, []).append(f"servo {servo_id}")
         return tuple(m.without_host(self.silence_s, tuple(motors)) for m, motors in kinds.items())
 
     def facts(self) -> dict[str, dict[str, str]]:
-        """Return firmware, supply voltage and temperature of each servo; see `Device.facts`."""
         link, family = self.link, self.family
         facts: dict[str, dict[str, str]] = {"firmware": {}, "voltage": {}, "temperature": {}}
         # An error of a servo, such as an alarm, does not keep its facts from the log.
@@ -334,11 +323,9 @@ class Servos(Device):
             raise SafetyStop("torque stays off: the servos have been made safe", hint="open them again")
 
     def rest(self) -> np.ndarray:
-        """Return the command that the servos follow since `enable`, ``(n,)``."""
         return (self._goals - self._zero) * self._unit
 
     def measure(self) -> Reading:
-        """Read angles [rad], speeds [rad/s] and loads, fractions of the largest, of all joints."""
         counts, transaction = self.link.read_counts(self.ids, self._state, "read of the state")
         position, speed, load = (counts[:, i] for i in self._of_state)
         return Reading(
@@ -397,7 +384,6 @@ class Servos(Device):
         )
 
     def require_watching(self) -> None:
-        """Raise SafetyStop if the guardian has taken over, or has died."""
         if self._link is not None and self._link.guardian is not None:
             self._link.guardian.require_watching()
 

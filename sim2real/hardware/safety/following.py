@@ -26,9 +26,9 @@ _PARTS: Final = 10
 _SLOW_RAD_S: Final = 0.5
 _LONGEST_S: Final = 0.05
 """Between two measurements farther apart, as of a host that was held up, forces change too much to tell a push [s]."""
-_UNSURE: Final = 0.25
+_UNSURE: Final = 0.15
 """Share of the time between two measurements by which their times, or those of commands, may be uncertain."""
-_ENOUGH: Final = 1.0
+_ENOUGH: Final = 3.0
 """Sum of the squares of a joint's changes of speed from which on they tell, against noise of 0.05 rad/s [rad^2/s^2]."""
 
 Push: TypeAlias = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]

@@ -129,7 +129,6 @@ class UnitreeLegs(Device):
 
     @property
     def silence_s(self) -> float:
-        """Longest time without a command or a measurement while torque is on [s]; 0: unlimited."""
         return self._silence_s
 
     @property
@@ -139,12 +138,10 @@ class UnitreeLegs(Device):
 
     @property
     def parts(self) -> Mapping[str, ReadingPart]:
-        """The parts `PARTS`."""
         return PARTS
 
     @property
     def clock(self) -> Clock:
-        """The clock of the connection; before it is open, the machine's."""
         return self._clock
 
     @property
@@ -161,7 +158,6 @@ class UnitreeLegs(Device):
 
     @property
     def counters(self) -> Counters:
-        """Counts of states and commands since `open`."""
         return Counters() if self._stream is None else self._stream.counters(self._published)
 
     def open(self) -> None:
@@ -204,7 +200,6 @@ class UnitreeLegs(Device):
         return (WithoutHost("Go2", self.motors, Alone.GOES_ON, math.inf, _SOURCE, "no other reaction is documented"),)
 
     def facts(self) -> dict[str, dict[str, str]]:
-        """Return the versions that the robot's state has, the battery's voltage and the motors' temperatures."""
         # Versions of 0 are those that the robot does not report.
         record = self._next()[0].record
         bms = record["bms_state"]
@@ -218,7 +213,6 @@ class UnitreeLegs(Device):
         }
 
     def reach(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the lowest and the highest q, dq, kp, kd and tau, each ``(12, 5)``."""
         low, high = self.drive.reach
         return low[self._places], high[self._places]
 
@@ -288,7 +282,6 @@ class UnitreeLegs(Device):
             _require_alone(self.robot, SafetyStop)
 
     def require_watching(self) -> None:
-        """Raise SafetyStop as `beat` does, also when no sign of life is due."""
         if self.armed and self._guardian is not None:
             self._guardian.require_watching()
 

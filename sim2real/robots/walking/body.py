@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from sim2real.arrays import namespace
-from sim2real.emulation.body import measured_dtype
+from sim2real.emulation.plant import measured_dtype
 from sim2real.errors import UsageError
 from sim2real.types import Array, Scalar
 
@@ -145,7 +145,7 @@ class HiddenTwin:
 
 
 class LeggedBody:
-    """A robot of an MJCF file with hidden parameters; see ``sim2real.emulation.body.Body``.
+    """A robot of an MJCF file with hidden parameters; see ``sim2real.emulation.plant.Body``.
 
     Every geom collides, with elliptic cones. The torque of a motor is its law's, limited to the actuator's range, times
     the motor's strength. The motor reports the torque of its law, as it does not know its strength. Its encoder has a

@@ -57,12 +57,6 @@ def test_a_file_of_lerobots(written):
             assert joint.count(joint.angle(count)) == count
 
 
-def test_a_gear_turns_the_joint_less_than_the_servo():
-    joint = Joint("base", 1, gear=0.25)
-    assert joint.angle(4095) == pytest.approx(2047 * 2 * math.pi / 4096 / 4)
-    assert joint.count(joint.angle(4095)) == 4095
-
-
 def entry(**changes):
     whole = {"id": 1, "drive_mode": 0, "homing_offset": 0, "range_min": 100, "range_max": 4000} | changes
     return {"elbow": {key: value for key, value in whole.items() if value is not None}}
@@ -98,7 +92,7 @@ def test_a_file_that_is_not_there(tmp_path):
         read_calibration(tmp_path / "none.json")
 
 
-@pytest.mark.parametrize("bad", [{"direction": 0}, {"gear": 0.0}, {"low_count": 9, "high_count": 9}])
+@pytest.mark.parametrize("bad", [{"direction": 0}, {"low_count": 9, "high_count": 9}])
 def test_joints_that_make_no_sense(bad):
     with pytest.raises(UsageError, match="joint 'elbow'"):
         Joint("elbow", 1, **bad)

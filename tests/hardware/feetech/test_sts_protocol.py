@@ -17,8 +17,8 @@ GOAL = b"\x00\x08\x00\x00\xe8\x03"
         (build(1, Instruction.READ, b"\x38\x02"), "FF FF 01 04 02 38 02 BE"),
         (build(0xFE, Instruction.WRITE, b"\x05\x01"), "FF FF FE 04 03 05 01 F4"),
         (build(1, Instruction.WRITE, b"\x2a" + GOAL), "FF FF 01 09 03 2A 00 08 00 00 E8 03 D5"),
-        (build(10, Instruction.REG_WRITE, b"\x2a" + GOAL), "FF FF 0A 09 04 2A 00 08 00 00 E8 03 CB"),
-        (build(0xFE, Instruction.ACTION), "FF FF FE 02 05 FA"),
+        (build(10, 0x04, b"\x2a" + GOAL), "FF FF 0A 09 04 2A 00 08 00 00 E8 03 CB"),
+        (build(0xFE, 0x05), "FF FF FE 02 05 FA"),
         (build(0xFE, Instruction.SYNC_READ, b"\x38\x08\x01\x02"), "FF FF FE 06 82 38 08 01 02 36"),
         (build(1, 0, b"\x18\x05"), "FF FF 01 04 00 18 05 DD"),
         (

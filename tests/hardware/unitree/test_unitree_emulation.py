@@ -8,8 +8,8 @@ from sim2real.emulation.truth import Kind, TruthLog, read_truth
 from sim2real.errors import UsageError
 
 pytest.importorskip("cyclonedds")
-from sim2real.emulation.faults import truth_header
 from sim2real.emulation.legs import EmulatedLegs, UnitreeEmulation
+from sim2real.emulation.robot import truth_header
 from sim2real.hardware.unitree.messages import HEAD, LOW_LEVEL, NO_POSITION, NO_VELOCITY, LowCmd
 
 MS = 1_000_000

@@ -92,7 +92,7 @@ class Axis:
             self.properties[STATE] = state
 
 
-class Board(PlannedBus):
+class Board(PlannedBus["ODriveEmulation"]):
     """An ODrive on its line, driving a plant with one motor of id 0.
 
     Args:
@@ -131,7 +131,7 @@ class Board(PlannedBus):
             axis.properties[_ERROR] = 0
         elif word == "f":
             sample = self.measure(axis, request.t_ns)
-            turns = axis.turns + 1000.0 * self.ill(self._config.wild, request.t_ns)
+            turns = axis.turns + 1000.0 * self.ill(self.config.wild, request.t_ns)
             answer = f"{turns:f} {axis.turns_per_s:f}"
         elif word == "r":
             answer = f"{axis.properties[rest[0]]:f}" if rest[0] in axis.properties else "invalid property"

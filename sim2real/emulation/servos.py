@@ -1,10 +1,21 @@
-"""The firmware of one emulated servo, made of its family's table, with hooks where families differ."""
+"""Emulated servos of any family, made of its table: the firmware of one, and their bus, which carries out instructions.
+
+As it is, a servo is a position servo that confirms what is written, drops what its registers cannot hold without an
+error, and has no watchdog. A family overrides what its firmware does differently.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import ClassVar, Final
+import time
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import ClassVar, Final, Generic, TypeVar
 
+from sim2real.emulation.bus import BusEmulation, PlannedBus, Request, Sample
+from sim2real.emulation.plant import Plant
+from sim2real.emulation.truth import TruthLog
+from sim2real.hardware.bus.packets import BROADCAST_ID, Instruction, Parser
 from sim2real.hardware.bus.registers import RETURN_DELAY_UNIT_S, Family, Register
 from sim2real.hardware.device import OperatingMode
 
@@ -13,9 +24,6 @@ _DAMAGED: Final = 1  # an error of `refusal` that the family does not report
 
 class ServoFirmware:
     """Registers and firmware of one servo, without time, bus and physics.
-
-    As it is: a position servo that confirms what is written, drops what its registers cannot hold without an error, and
-    has no watchdog.
 
     Args:
         return_delay_us: Return Delay Time at power-up, rounded to the register's unit of 2 us [us].
@@ -38,11 +46,9 @@ class ServoFirmware:
     def __init__(
         self, servo_id: int, model_number: int, return_delay_us: int = 500, encoder_counts: int = 4096
     ) -> None:
-        self.servo_id = servo_id
-        self.heard_ns = 0
+        self.servo_id, self.heard_ns = servo_id, 0
         self._encoder_counts = encoder_counts
         self._memory = bytearray(self.family.size)
-        self._registered: tuple[int, bytes] | None = None
         for register in self.family.registers.values():
             self.put(register, register.default)
         self.put(self.family.model_number, model_number)
@@ -57,7 +63,7 @@ class ServoFirmware:
         """Set a register, without the checks of a write from the bus."""
         self._memory[register.address : register.end] = register.encode(value)
 
-    # -- what the bus asks
+    # What the bus asks
 
     @property
     def return_delay_s(self) -> float:
@@ -110,31 +116,17 @@ class ServoFirmware:
             self.switched_on()
         return 0, moved and bool(was_on or is_on)
 
-    def register_write(self, address: int, data: bytes) -> None:
-        """Store a REG_WRITE until the next ACTION."""
-        self._registered = (address, data)
-
-    def action(self) -> tuple[int, bool]:
-        """Carry out the stored write, if there is one; return as `write`."""
-        if self._registered is None:
-            return 0, False
-        stored, self._registered = self._registered, None
-        return self.write(*stored)
-
     def reboot(self) -> None:
         """Restart as after a loss of power: torque off, and all registers outside the EEPROM at their defaults."""
-        self._registered = None
         for register in self.family.registers.values():
             if not register.eeprom:
                 self.put(register, register.default)
 
-    # -- what the motor does
+    # What the motor does
 
     def command(self) -> tuple[int, float]:
         """Return mode and goal of the motor, as ``Plant.command`` takes them, according to the registers."""
-        if not self.get(self.family.torque):
-            return OperatingMode.OFF, 0.0
-        return self.driven()
+        return self.driven() if self.get(self.family.torque) else (OperatingMode.OFF, 0.0)
 
     def driven(self) -> tuple[int, float]:
         """Return mode and goal while torque is on: the position [rad from the encoder's zero]."""
@@ -181,7 +173,7 @@ class ServoFirmware:
         """Shut down as after an overload: torque off, and an error reported from now on."""
         self.put(self.family.torque, 0)
 
-    # -- where families differ
+    # Where families differ
 
     def refusal(self, register: Register, value: int) -> int:
         """Return the firmware's error for a value, 0 if it takes it."""
@@ -198,3 +190,139 @@ class ServoFirmware:
 
     def switched_on(self) -> None:
         """React to the torque, which has gone on."""
+
+
+S = TypeVar("S", bound=ServoFirmware)
+E = TypeVar("E", bound=BusEmulation)
+
+
+class ServoBus(PlannedBus[E], Generic[S, E]):
+    """Emulated servos of one family on a bus, driving a plant; arguments as in `PlannedBus`.
+
+    Attributes:
+        wild_counts: Range of positions out of the motors' reach.
+    """
+
+    family: ClassVar[Family]
+    wild_counts: ClassVar[tuple[int, int]]
+
+    def __init__(
+        self,
+        plant: Plant,
+        config: E,
+        truth: TruthLog,
+        send: Callable[[bytes], bool],
+        start_ns: int,
+        now_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        self.form = self.family.form
+        self.servos = {i: self.make_servo(i, config) for i in sorted(plant.servo_ids)}
+        self._handlers: dict[int, Callable[[Request, list[S]], None]] = {
+            Instruction.PING: self._ping,
+            Instruction.READ: self._read,
+            Instruction.WRITE: self._write,
+            Instruction.REBOOT: self._reboot,
+            Instruction.SYNC_READ: self._sync_read,
+            Instruction.SYNC_WRITE: self._sync_write,
+        }
+        super().__init__(plant, config, truth, send, start_ns, now_ns, Parser(self.form), self.servos)
+
+    @abstractmethod
+    def make_servo(self, servo_id: int, config: E) -> S:
+        """Return a servo with these settings."""
+
+    def execute(self, request: Request) -> None:
+        packet = request.packet
+        # Every servo that receives the instruction resets its watchdog.
+        broadcast = packet.servo_id == BROADCAST_ID
+        targets = [s for i, s in self.servos.items() if broadcast or i == packet.servo_id]
+        if packet.intact:
+            for servo in targets:
+                servo.heard_ns = request.t_ns
+        handler = self._handlers.get(packet.code)
+        if targets and packet.intact and handler is not None:
+            handler(request, targets)
+        elif targets and not broadcast:
+            self._misunderstand(targets[0], request)
+
+    def _misunderstand(self, servo: S, request: Request) -> None:
+        """React to an instruction with a wrong checksum, or an unknown one: here without an answer."""
+
+    def _misread(self, servo: S, request: Request) -> None:
+        """React to a READ of a wrong length: here without an answer."""
+
+    def _ping(self, request: Request, targets: list[S]) -> None:
+        for servo in targets:
+            self._answer(servo, request, 0, servo.identity)
+
+    def _answer(self, servo: S, request: Request, error: int, data: bytes = b"", sample: Sample | None = None) -> None:
+        """Let a servo answer, with its measurement if the answer has present values."""
+        status = self._status(servo, error | servo.alert, data)
+        self.reply(servo.servo_id, request, status, servo.return_delay_s, sample)
+
+    def _status(self, servo: S, error: int, data: bytes) -> bytes:
+        return self.form.build_status(servo.servo_id, error, data)
+
+    def _confirm(self, servo: S, request: Request, error: int) -> None:
+        """Let a servo answer an instruction that writes."""
+        if request.packet.servo_id != BROADCAST_ID and servo.confirms:
+            self._answer(servo, request, error)
+
+    def _read_by(self, servo: S, request: Request) -> None:
+        """Let a servo answer a read."""
+        address, length = self.form.word(request.packet.parameters, 0), self._second_word(request)
+        sample = self.measure(servo, request.t_ns)
+        if self.ill(self.config.wild, request.t_ns):
+            servo.put(self.family.position, self.random.randrange(*self.wild_counts))
+        error, data = servo.read(address, length)
+        if servo.answers_reads:
+            present = self.family.position, self.family.velocity, self.family.load
+            measured = any(address < r.end and address + length > r.address for r in present)
+            self._answer(servo, request, error, data, sample if measured else None)
+
+    def _read(self, request: Request, targets: list[S]) -> None:
+        if request.packet.servo_id == BROADCAST_ID:
+            return
+        if len(request.packet.parameters) != 2 * self.form.address_bytes:
+            self._misread(targets[0], request)
+            return
+        self._read_by(targets[0], request)
+
+    def _sync_read(self, request: Request, targets: list[S]) -> None:
+        del targets
+        for servo_id in request.packet.parameters[2 * self.form.address_bytes :]:
+            if servo_id in self.servos:
+                self._read_by(self.servos[servo_id], request)
+
+    def _write(self, request: Request, targets: list[S]) -> None:
+        parameters = request.packet.parameters
+        address, data = self.form.word(parameters, 0), parameters[self.form.address_bytes :]
+        for servo in targets:
+            self._confirm(servo, request, self._write_to(servo, request, address, data))
+
+    def _sync_write(self, request: Request, targets: list[S]) -> None:
+        del targets
+        parameters, begin = request.packet.parameters, 2 * self.form.address_bytes
+        address, length = self.form.word(parameters, 0), self._second_word(request)
+        for i in range(begin, len(parameters) - length, length + 1):
+            if parameters[i] in self.servos:
+                self._write_to(self.servos[parameters[i]], request, address, parameters[i + 1 : i + 1 + length])
+
+    def _reboot(self, request: Request, targets: list[S]) -> None:
+        for servo in targets:
+            self._confirm(servo, request, 0)
+            servo.reboot()
+            self.configure(servo)
+            self.actuate(servo, request)
+
+    def _write_to(self, servo: S, request: Request, address: int, data: bytes) -> int:
+        """Let a servo change its registers, and the motor follow; return the error."""
+        self.measure(servo, request.t_ns)
+        error, moves = servo.write(address, data)
+        self.configure(servo)
+        if moves:
+            self.actuate(servo, request)
+        return error
+
+    def _second_word(self, request: Request) -> int:
+        return self.form.word(request.packet.parameters, self.form.address_bytes)

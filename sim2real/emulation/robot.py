@@ -1,11 +1,13 @@
-"""Latencies and faults that every emulated robot has, on a bus or over DDS, and when faults have begun."""
+"""What every emulated robot has, on a bus or over DDS: latencies, faults, planned time, and the header of its truth."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, Protocol
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
+from sim2real.emulation.truth import TruthLog
 from sim2real.errors import UsageError
 
 
@@ -29,6 +31,10 @@ class Emulation:
         on_signal: Whether these times count from SIGUSR1 to the process.
         seed: Seed of jitter, noise and chances.
     """
+
+    serve: ClassVar[str]
+    """``module:function`` that emulates the robot in a process: called with its `Task`, these
+    settings and a `StopFlag`, it returns when the flag is set."""
 
     sensing_latency_s: float = 0.0
     actuation_latency_s: float = 0.0
@@ -58,30 +64,15 @@ class Emulation:
                 raise UsageError(f"emulator: {name} = {getattr(self, name)} is outside [{low}, {high}]")
 
 
-class FaultTimes:
-    """When the faults of an emulated robot have begun.
-
-    Attributes:
-        faulty_ns: Time from which the times of faults count [ns]; None: the signal has not come.
-    """
-
-    def __init__(self, config: Emulation, start_ns: int) -> None:
-        self.faulty_ns = None if config.on_signal else start_ns
-
-    def has(self, after_s: float | None, t_ns: int) -> bool:
-        """Return whether a fault that begins ``after_s`` [s] has begun at a time [ns]; None: it never does."""
-        return after_s is not None and self.faulty_ns is not None and t_ns - self.faulty_ns >= 1e9 * after_s
-
-
 class Physics(Protocol):
     """What the truth file needs of a plant or a body."""
 
     def state(self) -> dict[str, float]:
-        """Return the true state."""
+        """Return the true state, with the same names at every call."""
         ...
 
     def truth(self) -> Mapping[str, Any]:
-        """Return the true parameters."""
+        """Return the true parameters, which an identification should find."""
         ...
 
 
@@ -89,3 +80,42 @@ def truth_header(physics: Physics, config: Emulation, start_ns: int) -> dict[str
     """Return the header of a truth file; ``start_ns`` is time 0 of the physics."""
     facts = {"servo_ids": list(getattr(physics, "servo_ids", ())), "state_names": list(physics.state())}
     return {"start_ns": start_ns, "config": asdict(config), **facts, "truth": physics.truth()}
+
+
+C = TypeVar("C", bound=Emulation)
+
+
+class PlannedRobot(ABC, Generic[C]):
+    """An emulated robot without process, port and threads. All times are CLOCK_MONOTONIC nanoseconds.
+
+    The times of all events are computed from the times at which the host's commands arrive, and do not depend on how
+    late the emulator's process runs.
+
+    Attributes:
+        config: The settings; they may change while it runs.
+        faulty_ns: Time from which the times of faults count [ns]; None: the signal has not come.
+    """
+
+    def __init__(self, config: C, truth: TruthLog, start_ns: int) -> None:
+        self.config, self.truth, self.start_ns = config, truth, start_ns
+        self.faulty_ns = None if config.on_signal else start_ns
+
+    @abstractmethod
+    def next_due_ns(self) -> int | None:
+        """Return the time of the next event; None if there is none."""
+
+    @abstractmethod
+    def run_until(self, t_ns: int) -> None:
+        """Process all events up to a time, in order."""
+
+    def begin_faults(self, t_ns: int) -> None:
+        """Count the times of faults from a time."""
+        self.faulty_ns = t_ns
+
+    def has(self, after_s: float | None, t_ns: int) -> bool:
+        """Return whether a fault that begins ``after_s`` [s] has begun at a time; None: it never does."""
+        return after_s is not None and self.faulty_ns is not None and t_ns - self.faulty_ns >= 1e9 * after_s
+
+    def is_silent(self, t_ns: int) -> bool:
+        """Return whether nothing is received or sent at a time."""
+        return self.has(self.config.silent_after_s, t_ns)
