@@ -328,11 +328,12 @@ class Device(ABC):
         """
 
     def soften(self, command: np.ndarray, left: float) -> np.ndarray:
-        """Return a command of a soft stop, in place of the last one.
+        """Return a command of a soft stop.
 
         Default: a command that is zero when stale fades, and one that is held stays. Columns need another method.
 
         Args:
+            command: The last command before the soft stop; the newest one if it fades to zero.
             left: Share of the fade that is left, from 1 to 0.
 
         Raises:

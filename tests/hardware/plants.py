@@ -140,36 +140,6 @@ class Still:
     servo_ids: tuple[int, ...] = (1,)
 
 
-def mean_latencies(truth) -> dict[str, float]:
-    """Return the session's mean latencies [s]; NaN without samples, or without effects.
-
-    `sensing_s`: age of a sample when its answer reaches the host. `actuation_s`: time from the arrival of a goal's
-    bytes to its effect. `sample_before_request_s`: time from the sample to the arrival of the read's bytes;
-    negative if sampled later.
-    """
-    from sim2real.emulation.truth import Kind  # not in a robot's process
-
-    samples = truth.of(Kind.SAMPLE)
-    effects = truth.of(Kind.EFFECT)
-    effects = effects[effects["t_host_ns"] > 0]
-    return {
-        "sensing_s": _mean_s(samples["t_done_ns"] - samples["t_ns"]),
-        "actuation_s": _mean_s(effects["t_ns"] - effects["t_host_ns"]),
-        "sample_before_request_s": _mean_s(samples["t_host_ns"] - samples["t_ns"]),
-    }
-
-
-def _mean_s(durations_ns):
-    return float(durations_ns.mean() * 1e-9) if durations_ns.size else float("nan")
-
-
-def lateness_s(truth):
-    """Return the lateness of each answer against the plan, shape (N,) [s]: the emulator's real-time error."""
-    from sim2real.emulation.truth import Kind
-
-    return 1e-9 * truth.rows["late_ns"][[kind in (Kind.SAMPLE, Kind.REPLY) for kind in truth.rows["kind"]]]
-
-
 class Sinking(Joints):
     """Joints that sink at 0.6 rad/s without torque, from 0.9 s on, to -1.4 rad."""
 

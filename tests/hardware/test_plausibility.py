@@ -79,6 +79,14 @@ def test_what_comes_to_rest_by_itself_is_normal(path, pushed):
     judge(path, pushed)
 
 
+def test_a_swinging_joint_that_a_host_finds_where_it_was_after_a_pause_is_not_frozen():
+    check = Plausibility(FREE)
+    for k in range(6):
+        check.check(np.array([0.0, 0.1 * k]), k * PERIOD_S, 0.0, PUSHED)
+    check.check(np.array([0.0, 0.5]), 5 * PERIOD_S + 0.14, 0.0, PUSHED)
+    check.check(np.array([0.0, 0.4]), 6 * PERIOD_S + 0.14, 0.0, PUSHED)
+
+
 @pytest.mark.parametrize(
     ("stale", "sent", "pushed"),
     [

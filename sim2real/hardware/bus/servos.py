@@ -232,12 +232,6 @@ class Servos(Device):
         return Counters() if self._link is None else self._link.counters
 
     @property
-    def guardian_pid(self) -> int | None:
-        """Process id of the guardian; None before it is started."""
-        guardian = None if self._link is None else self._link.guardian
-        return None if guardian is None else guardian.pid
-
-    @property
     def _watchdog_count(self) -> int:
         """Value of the watchdog's register: `silence_s` in its unit, at least 1 unless it is 0 (off)."""
         watchdog = self.family.watchdog

@@ -9,6 +9,8 @@ from sim2real.hardware.device import ReadingPart
 from sim2real.hardware.safety.gate import GateConfig
 from sim2real.leaps import STAMP_S, reach_rad
 
+_SAMPLES = 3
+"""Number of readings in a row that must be the same before an encoder counts as frozen."""
 _MIN_SPEED_RATIO = 0.5
 """The smallest share of its speed that a joint keeps from one reading to the next."""
 
@@ -40,7 +42,8 @@ class Plausibility:
     uncertainty of times and readings, the robot is stopped.
 
     **Freeze.** A joint that surely moved faster than ``freeze_rad_s`` from one reading to the next, and then reads the
-    same to the count for ``freeze_s`` though it is pushed, stops the robot: a motor needs time to stop. "Surely": more
+    same to the count for ``freeze_s`` and three readings though it is pushed, stops the robot: a motor needs time to
+    stop, and a host that was held up may find a swinging joint where it was. "Surely": more
     time may have passed between two samples than between their stamps, as the first may be older, and the second as
     late as its answer. An encoder that freezes just after a reading hardly moves until the following one, so half the
     speed from the reading before counts there, too.
@@ -56,7 +59,7 @@ class Plausibility:
         """Forget all measurements; called when torque goes on or off."""
         self._t_s: float | None = None
         self._unsure_s = 0.0
-        self._position = self._since_s = self._speed = self._before = np.zeros(0)
+        self._position = self._since_s = self._speed = self._before = self._same = np.zeros(0)
 
     def check(self, position_rad: np.ndarray, t_s: float, unsure_s: float, pushed: np.ndarray) -> None:
         """Check a measurement.
@@ -89,6 +92,7 @@ class Plausibility:
         # Freeze: it counts from the last motion.
         self._position = position_rad.copy()
         self._since_s[moved] = t_s + unsure_s
+        self._same = np.where(moved, 0, self._same + 1)
         self._require_no_freeze(t_s, pushed)
 
     def _begin(self, position_rad: np.ndarray, t_s: float, unsure_s: float) -> None:
@@ -96,7 +100,7 @@ class Plausibility:
         self._t_s, self._unsure_s, self._position = t_s, unsure_s, position_rad.copy()
         # Of each joint [rad/s]: before it stood still, and between the last two samples.
         self._speed, self._before = np.zeros(n), np.zeros(n)
-        self._since_s = np.full(n, t_s)
+        self._since_s, self._same = np.full(n, t_s), np.zeros(n, np.int64)
         fastest = np.inf if self._config.max_speed_rad_s is None else self._config.max_speed_rad_s
         self._fastest = np.broadcast_to(np.asarray(fastest, np.float64), n)
 
@@ -138,7 +142,8 @@ class Plausibility:
         if not fast.any():
             return
         still_s = t_s - self._since_s
-        for i in np.flatnonzero(fast & (still_s >= self._config.freeze_s) & pushed):
+        lasting = (still_s >= self._config.freeze_s) & (self._same >= _SAMPLES)
+        for i in np.flatnonzero(fast & lasting & pushed):
             raise SafetyStop(
                 f"{self._config.joint(int(i))} has read {self._position[i]:.6g} rad for {still_s[i]:.2f} s, "
                 f"but moved at {self._speed[i]:.2g} rad/s or more just before",

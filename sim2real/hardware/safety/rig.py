@@ -92,6 +92,7 @@ class Rig:
         self._checked_s = 0.0
         self._sampled_s: float | None = None
         self._eased_s: float | None = None
+        self._before_stop: np.ndarray | None = None
         self._commanded_s: float | None = None
         self._tick: int | None = None
         self.repeats = 0
@@ -283,7 +284,7 @@ class Rig:
 
         Voltages fade to zero, goals keep their values, and legs sit down.
         """
-        self._eased_s = self._now_s()
+        self._eased_s, self._before_stop = self._now_s(), self._sent
 
     @property
     def eased(self) -> bool:
@@ -300,12 +301,12 @@ class Rig:
         return passed_s > self.gate.config.stop_s or (faded and still)
 
     def _softened(self, command: np.ndarray) -> np.ndarray:
-        if self._eased_s is None or self._sent is None:
+        if self._eased_s is None or self._before_stop is None:
             return command
         # A goal that is held stays the last one; a voltage that fades is the agent's newest.
-        columns, holds = self.gate.config.has_columns, self.gate.config.holds
         left = 1.0 - (self._now_s() - self._eased_s) / (_FADE * self.gate.config.stop_s)
-        last = self._sent if holds or columns else np.asarray(command)
+        keeps = self.gate.config.holds or self.gate.config.has_columns
+        last = self._before_stop if keeps else np.asarray(command)
         return self._mounting.to_joints(self.device.soften(self._mounting.to_motors(last), max(0.0, left)))
 
     def wait_until_still(self, timeout_s: float, speed_rad_s: float = _STILL_RAD_S, for_s: float = 0.5) -> Reading:

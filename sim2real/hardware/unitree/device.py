@@ -99,7 +99,7 @@ class UnitreeLegs(Device):
         self.address, self.drive = Address.parse(port), drive or LegDrive()
         self._silence_s, self._max_silence_s = silence_s, max_silence_s
         self._places = np.array(ids)
-        self._rest, self._left = np.zeros((MOTORS, 5)), 1.0
+        self._rest = np.zeros((MOTORS, 5))
         self._damp = self.drive.damp()  # built here, as make_safe must not need any time
         self._clock: Clock = SYSTEM_CLOCK
         self._robot: DdsLink | None = None
@@ -150,11 +150,6 @@ class UnitreeLegs(Device):
         if self._robot is None:
             raise HardwareLost(f"the robot on {self.address} is not open", hint="call open first")
         return self._robot
-
-    @property
-    def guardian_pid(self) -> int | None:
-        """Process id of the guardian; None before it is started."""
-        return None if self._guardian is None else self._guardian.pid
 
     @property
     def counters(self) -> Counters:
@@ -218,7 +213,7 @@ class UnitreeLegs(Device):
 
     def enable(self) -> None:
         """Start the guardian, and let all motors damp at their positions; see `Device.enable`."""
-        self._left, self._rest = 1.0, np.zeros((MOTORS, 5))
+        self._rest = np.zeros((MOTORS, 5))
         low, high = self.reach()
         # A robot that lies may rest on the stops of its joints, a little beyond their range.
         self._rest[:, 0] = np.clip(self.measure().position_rad, low[:, 0], high[:, 0])
@@ -269,11 +264,8 @@ class UnitreeLegs(Device):
 
     def soften(self, command: np.ndarray, left: float) -> np.ndarray:
         """Return the command with a smaller position gain and torque, and more damping: the robot sinks."""
-        # The rig gives the softened command of its last call, so this call's share is the ratio of both.
-        share = left / self._left if 0.0 < left < self._left else float(left > 0.0)
-        self._left = left
-        softer = command * [1.0, share, share, share, share]
-        softer[:, 3] += (1.0 - share) * self.drive.damping
+        softer = command * [1.0, left, left, left, left]
+        softer[:, 3] += (1.0 - left) * self.drive.damping
         return softer
 
     def check(self) -> None:

@@ -154,7 +154,8 @@ def _type(name: str, *bases: type) -> Any:
     for field, kind, count in _fields(name):
         element = _NUMBERS.get(kind) or _type(kind)
         hints[field] = types.array[element, count] if count else element
-    meta, all_bases = type(idl.IdlStruct), (idl.IdlStruct, *bases)
+    meta: Any = type(idl.IdlStruct)
+    all_bases = (idl.IdlStruct, *bases)
     space = meta.__prepare__(name, all_bases, typename=f"unitree_go.msg.dds_.{name}_")
     space["__annotations__"].update(hints)
     made = annotations.final(annotations.autoid("sequential")(meta(name, all_bases, space)))
@@ -164,9 +165,9 @@ def _type(name: str, *bases: type) -> Any:
 def _message(name: str, motors: str, padding: int) -> Any:
     """Return the class of a message, which `cyclonedds` encodes as a record."""
     message = _type(name, _Record)
-    message.layout = _layout(name)
-    message._cut = message.layout.fields[motors][1] - padding
-    message._content = _content(message.layout)
+    layout: Any = _layout(name)
+    message.layout, message._content = layout, _content(layout)
+    message._cut = layout.fields[motors][1] - padding
     message.serialize = lambda self, **_: self.to_wire()
     message.deserialize = lambda data, **_: message.from_wire(data)
     # A writer that leaves sends the fields of a key; these messages have none.
@@ -176,10 +177,10 @@ def _message(name: str, motors: str, padding: int) -> Any:
 
 if TYPE_CHECKING:
 
-    class LowCmd(_Record):
+    class LowCmd(_Record, idl.IdlStruct):
         """A command of all motors; its torque is ``tau + kp (q - measured q) + kd (dq - measured dq)`` in the motor."""
 
-    class LowState(_Record):
+    class LowState(_Record, idl.IdlStruct):
         """The state of all motors, the inertial measurement unit, the feet and the battery."""
 
 else:
