@@ -8,14 +8,6 @@ from sim2real.hardware.safety.gate import GateConfig, SafetyGate
 from sim2real.hardware.safety.limits import GateLimits
 
 
-def test_commands_within_limits_pass_unchanged():
-    gate = SafetyGate(GateConfig(limit=1.0))
-    command = np.array([0.3, -0.9], dtype=np.float32)
-    assert np.array_equal(gate.apply(command, 0.01, 0.0), command.astype(np.float64))
-    assert gate.counts.passed == 1
-    assert (gate.counts.clamped, gate.counts.slewed, gate.counts.stale) == (0, 0, 0)
-
-
 def test_clamping_symmetric_and_not():
     gate = SafetyGate(GateConfig(limit=0.5))
     assert gate.apply(np.array([2.0, -2.0, 0.1]), 0.0, 0.0).tolist() == [0.5, -0.5, 0.1]
@@ -130,20 +122,6 @@ def test_stale_holds_what_was_allowed_last_and_is_counted():
     assert gate.counts.stale == 2
     with pytest.raises(SafetyStop):
         gate.apply(np.array([float("nan")]), 1.0, 2.0)
-
-
-def test_time_without_commands_earns_a_held_position_no_leap():
-    gate = holding([0.2], slew_per_s=1.0, command_timeout_s=0.1)
-    gate.apply(np.array([1.0]), 0.0, 0.0)
-    assert gate.apply(np.array([1.0]), 0.0, 60.0) == pytest.approx(0.3)
-
-
-def test_a_start_outside_the_limits_slews_into_them():
-    gate = holding([3.0], slew_per_s=10.0)
-    outputs = [float(gate.apply(np.array([0.5]), 0.0, 0.1 * k)[0]) for k in range(5)]
-    assert outputs == pytest.approx([3.0, 2.0, 1.0, 0.5, 0.5])
-    gate = holding([3.0], slew_per_s=10.0)
-    assert gate.apply(np.array([0.5]), 1.0, 0.0) == 3.0
 
 
 @given(

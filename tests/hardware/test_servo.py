@@ -50,14 +50,6 @@ def test_writes_that_are_refused(servo, address, data, error):
     assert servo.write(address, data)[0] == error
 
 
-def test_a_write_of_several_registers_is_all_or_nothing(servo):
-    led_on_torque_wrong = b"\x02\x01"
-    assert servo.write(reg.TORQUE_ENABLE.address, led_on_torque_wrong)[0] == StatusError.DATA_RANGE
-    assert servo.get(reg.LED) == 0
-    assert servo.write(reg.TORQUE_ENABLE.address, b"\x01\x01") == (StatusError.NONE, True)
-    assert servo.get(reg.LED) == 1
-
-
 def test_present_registers():
     servo = in_mode(EmulatedServo(1, encoder_counts=1024), OperatingMode.PWM)
     write(servo, reg.GOAL_PWM, 442)
