@@ -10,6 +10,7 @@ from small_robot import SERVOS, SHEET, VALUES, PairRobot
 
 from sim2real.robots.messages import EpisodeStart
 from sim2real.robots.servo.servos import DataSheet
+from sim2real.robots.servo.task import ServoMoment
 
 
 def slouching():
@@ -40,6 +41,12 @@ def test_nominal_values_are_the_data_sheets_without_delays(pair):
     }
     for p in pair.model.dynamics():
         assert p.low < p.nominal < p.high
+
+
+def test_fast_goals_cost_a_hundredth_of_the_mean_square_of_their_share_of_the_largest_speed(pair):
+    now = ServoMoment(jnp.array([0.1, 0.2]), jnp.zeros(2), jnp.zeros(1))
+    terms = pair.task.reward(now, jnp.array([2.0, -1.0]))  # of 2 rad/s
+    assert {n: float(v) for n, v in terms.items()} == {"task": pytest.approx(-0.05), "speed": pytest.approx(-0.00625)}
 
 
 def test_parameters_land_in_the_nodes_that_need_them(pair):
