@@ -149,6 +149,7 @@ def test_a_real_disk_is_foretold_over_two_minutes(free_run):
     assert rmse(model - measured) < 0.025
 
 
+@pytest.mark.night
 def test_so_does_a_loop_of_our_own(recording, free_run):
     _, measured, model = free_run
     voltage, read = recording.outputs["actuator"]["action"][:, 0], recording.outputs["sensor"]["th"]

@@ -126,6 +126,7 @@ def test_a_real_servo_is_foretold_at_a_gain_that_was_not_fitted(whole):
     assert np.mean([np.abs(model - measured).mean() for _, measured, model in whole]) < 0.030
 
 
+@pytest.mark.night
 def test_so_does_a_loop_of_our_own(recordings, whole):
     """From the model's own start: where it was measured, at rest."""
     errors = []
