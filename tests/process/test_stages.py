@@ -104,7 +104,7 @@ def viewers():
             words, fields = (process / "cmdline").read_text(), (process / "stat").read_text().rpartition(")")[2].split()
         except OSError:
             continue
-        if "viewer_process" in words and int(fields[1]) == os.getpid():
+        if "sim2real.stages.live" in words and int(fields[1]) == os.getpid():
             found.append(int(process.name))
     return found
 
