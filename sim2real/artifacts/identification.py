@@ -528,7 +528,7 @@ class Identification(Shown):
         left_out: A fit for each held-out part; empty without folds.
         expected_error: The error to expect of each position on later data, ahead and in a free run.
         compared: Errors on held-out data, beside the errors that the held-out parts let expect.
-        ranges: Signal -> its range in the fitted segments; see ``segments.ranges``.
+        motion: Column -> lowest and highest position, and largest speed, in the fitted segments.
         tried: What optional terms gain on held-out parts; empty if none was tried.
         terms: Optional terms of the model in the fit; None if the model has no optional terms.
         noise: Noise of the sensor; empty in older files.
@@ -559,7 +559,7 @@ class Identification(Shown):
     left_out: tuple[HeldOutPart, ...] = ()
     expected_error: tuple[ExpectedError, ...] = ()
     compared: tuple[ComparedError, ...] = ()
-    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    motion: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     tried: tuple[TriedTerm, ...] = ()
     terms: tuple[str, ...] | None = None
     links: tuple[Link, ...] = ()

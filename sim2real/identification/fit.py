@@ -1,12 +1,10 @@
 """From recordings to an estimate: search on windows, descend by least squares, descend on longer segments.
 
-scipy's trust-region method takes the steps of a descent, within the bounds and with a robust loss. The loss that
-decides is that with initial states solved for at the point itself.
+The loss that decides is that with initial states solved for at the point itself.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -34,6 +32,9 @@ _COARSE = 1e-3
 """Relative gain of the loss at which the descent from each start ends; that from the best start continues."""
 _ROUGH = 1e-2
 """The same for a model that others are compared with by percents."""
+_NEARLY, _APART = 1.5, 0.02
+"""Ratio of two losses after a rough descent up to which both starts are followed, if their ends are farther apart than
+this share of the bounds' width."""
 _ROUNDS, _BACK = 4, 4
 """Most rounds of a descent, and how often a round goes half the way back to its start."""
 _NEAR = 1e-5
@@ -46,8 +47,11 @@ _POLLED, _AWAY, _BETTER = 12, 0.5, 1e-3
 """Points that are tried around a descent that ended with more left; how far away [standard errors]; and by which share
 their loss must be lower. Where friction sticks, the derivative at a point does not describe the points around it."""
 _TRIES = 3
-_LOSSES = {"squared": "linear", "huber": "soft_l1", "cauchy": "cauchy"}
-"""Names of the losses in scipy."""
+_DAMPING, _EASIER, _HARDER, _FAILED = 1e-3, 0.2, 10.0, 5
+"""First damping of a round, as a share of the curvature; its factors after a good and after a failed step; steps that
+fail in turn and end a round."""
+_AS_PREDICTED = 0.25
+"""Least share of the predicted gain in a step that may end a round by its small gain."""
 OnStep = Callable[[float, np.ndarray], None]
 """Called with the best loss and point ``(P,)`` so far, after every evaluation."""
 OnProgress = Callable[[str, float, float, np.ndarray], None]
@@ -133,7 +137,6 @@ def fit(
     long_spans: Sequence[Span] = (),
     report: OnProgress | None = None,
     on_begin: Callable[[Problem], None] | None = None,
-    as_start: bool = False,
     end: np.ndarray | None = None,
 ) -> Fit:
     """Identify a model.
@@ -142,7 +145,6 @@ def fit(
         spans: Segments to fit, and segments to predict.
         length_s: Length of a segment [s].
         long_spans: Segments of ``config.long_s`` for the last refinement.
-        as_start: Whether the fit only has to be a start for fits with some of the optional terms.
         end: Shape ``(P,)``: where a fit of nearly this model ended. Only the last refinement is made, from there: one
             on windows may leave a minimum that long segments have.
     """
@@ -160,9 +162,7 @@ def fit(
         x, loss = result.x, result.loss
     # Refine by least squares, first on windows, then on long segments.
     refined, longer = list[Refined](), bool(config.refine_steps and config.long_s and long_spans)
-    if config.refine_steps and as_start and problem.table.terms:
-        refined += _roughly(problem, starts, report)
-    elif config.refine_steps and (end is None or not longer):
+    if config.refine_steps and (end is None or not longer):
         # Where all segments take long, the best of several descents on some of them begins the descent on all.
         few = few_of(problem) if end is None else problem
         refined += [_refine(few, starts, report)] if few is not problem else []
@@ -174,7 +174,6 @@ def fit(
     # Test whether the end is a minimum.
     if refined:
         x, loss, left, converged = refined[-1].x, refined[-1].loss, refined[-1].left, refined[-1].converged
-        loss = problem.loss(x) if as_start else loss  # a start is found on some of the segments
     else:
         left = remaining(problem, x)
         converged = left < _CONVERGED
@@ -184,15 +183,25 @@ def fit(
 def refit(problem: Problem, present: np.ndarray, near: np.ndarray) -> dict[str, float]:
     """Return a rough estimate of fewer parameters; the others have their values in a model without them.
 
+    The descent begins at the best of the estimate of all parameters, a linear step from it, and the table's start.
+
     Args:
         present: Shape ``(P,)``, bool: which free parameters are estimated.
-        near: Shape ``(P,)``: the estimate of all parameters, one of two starts; the other is the table's.
+        near: Shape ``(P,)``: the estimate of all parameters.
     """
     table = problem.table
     if not present.any():
         return as_numbers(table, near, present)
-    starts, few = np.stack([near, table.start()]), few_of(problem)
-    return as_numbers(table, refine(few, starts, few.part(present=present), coarse=True).x, present)
+    few = few_of(problem)
+    at, off = few.linearise(near), table.encode({p.name: p.without for p in table})
+    J, moved = at.jacobian.reshape(-1, len(near)), np.where(present, 0.0, off - near)
+    left = at.residuals.reshape(-1) + J @ moved
+    moved[present] = -np.linalg.lstsq(J[:, present] * table.span[present], left, rcond=1e-6)[0] * table.span[present]
+    part = few.part(present=present)
+    starts = table.within(np.stack([near + moved, near, table.start()]))
+    losses = np.nan_to_num([few.loss(x, part) for x in starts], nan=np.inf)
+    best = starts[int(np.argmin(losses))]
+    return as_numbers(table, refine(few, best[None], part, coarse=True).x, present)
 
 
 def run_search(problem: Problem, start: np.ndarray, report: OnProgress | None = None) -> SearchResult:
@@ -202,8 +211,11 @@ def run_search(problem: Problem, start: np.ndarray, report: OnProgress | None = 
         start: Shape ``(P,)``: middle of the first generation.
     """
     config, table = problem.config, problem.table
-    part = problem.part()
-    losses = problem.residuals.generations(part)
+    # Few segments suffice for a search: all 23 of an arm took 2.6 times as long.
+    few = problem.residuals.liveliest(problem.part())
+
+    def losses(candidates: np.ndarray, middle: np.ndarray) -> np.ndarray:
+        return problem.losses(candidates, middle, few)
 
     def advance(best: float, x: np.ndarray) -> None:
         if report:
@@ -224,6 +236,7 @@ def refine(
     settle: bool = True,
     gain: float | None = None,
     on_step: OnStep | None = None,
+    slopes: int | None = None,
 ) -> Refined:
     """Descend from each start, and from the best end to the minimum.
 
@@ -233,8 +246,9 @@ def refine(
         coarse: Whether the first descents suffice, to compare with a model by percents.
         settle: Whether the end is tested, and points around it are tried if it is no minimum.
         gain: Relative gain of the loss at which the first descents end; default: by the other arguments.
+        slopes: Most Jacobians of a round that are computed, not corrected; default: as many as it needs.
     """
-    descent = _Descent(problem, part or problem.part(), on_step)
+    descent = _Descent(problem, part or problem.part(), on_step, slopes)
     starts = problem.table.within(np.asarray(starts, np.float64))
     first = [descent.loss(x) for x in starts]
     if not np.isfinite(first).any():
@@ -242,10 +256,17 @@ def refine(
             "no start of the refinement can be simulated: every loss is infinite or no number",
             hint="search first, with generations above 0, or check the nominal values",
         )
-    # Descend roughly from each start.
+    # Descend roughly from each start, and further from those that may lead to the best end.
     fine = problem.residuals.precision
     first_gain = gain or (_ROUGH if coarse else _COARSE if settle else fine)
-    x, loss = min((descent.down(x, first_gain) for x in starts[np.isfinite(first)]), key=lambda end: end[1])
+    ends = [(x, 0.0) for x in starts[np.isfinite(first)]]
+    if len(ends) > 1:
+        rough = sorted((descent.down(x, max(_ROUGHLY, first_gain)) for x, _ in ends), key=lambda end: end[1])
+        ends = rough[:1]
+        for x, loss in rough[1:]:
+            apart = min(float(np.max(np.abs(x - y) / problem.table.span)) for y, _ in ends)
+            ends += [(x, loss)] if loss < _NEARLY * rough[0][1] and apart > _APART else []
+    x, loss = min((descent.down(x, first_gain) for x, _ in ends), key=lambda end: end[1])
     if coarse or not settle:
         return Refined(x, loss, float(np.nanmin(first)), descent.steps, np.nan, False)
     # Descend from the best end to the minimum.
@@ -280,6 +301,29 @@ def remaining(problem: Problem, x: np.ndarray, part: Part | None = None) -> floa
     return float(np.max(np.abs(np.clip(step, low, high)) / np.sqrt(np.diag(covariance)), initial=0.0))
 
 
+def bounded_step(H: np.ndarray, g: np.ndarray, x: np.ndarray, table: ParameterTable, free: np.ndarray) -> np.ndarray:
+    """Return the step ``(P,)`` to the minimum of a quadratic function within the bounds.
+
+    Parameters stop at their bounds, and the others are optimised with these values.
+
+    Args:
+        H: Shape ``(P, P)``: half the second derivatives; as ``g``, half the gradient at ``x``.
+        free: Shape ``(P,)``, bool: which parameters move.
+    """
+    step, moving = np.zeros(len(x)), free.copy()
+    for _ in range(len(x)):
+        rest = np.flatnonzero(moving)
+        unit = table.span[rest]
+        rhs = (g + H[:, ~moving] @ step[~moving])[rest] * unit
+        step[rest] = -unit * np.linalg.lstsq(H[np.ix_(rest, rest)] * np.outer(unit, unit), rhs, rcond=None)[0]
+        beyond = moving & ((x + step < table.low) | (x + step > table.high))
+        if not beyond.any():
+            break
+        step[beyond] = (np.clip(x + step, table.low, table.high) - x)[beyond]
+        moving &= ~beyond
+    return np.clip(x + step, table.low, table.high) - x
+
+
 def _pull(table: ParameterTable, part: Part) -> np.ndarray:
     """Return how strongly each parameter is pulled to its nominal value, ``(P,)`` [1 / deviation].
 
@@ -297,8 +341,8 @@ class _Descent:
         steps: Evaluations so far.
     """
 
-    def __init__(self, problem: Problem, part: Part, on_step: OnStep | None) -> None:
-        self._problem, self._part, self._on_step = problem, part, on_step
+    def __init__(self, problem: Problem, part: Part, on_step: OnStep | None, slopes: int | None = None) -> None:
+        self._problem, self._part, self._on_step, self._slopes = problem, part, on_step, slopes
         self._best: tuple[float, np.ndarray] = (np.inf, np.zeros(0))
         self._nominal, self._weight = problem.table.nominal(), _pull(problem.table, part)
         self._deviation = 1.0
@@ -354,40 +398,61 @@ class _Descent:
         return 0.5 * float(np.sum((self._deviation * self._weight * (x - self._nominal)) ** 2) / max(count, 1))
 
     def _round(self, x: np.ndarray, gain: float) -> np.ndarray:
-        """Return where least squares ends from a point."""
-        from scipy.optimize import least_squares  # 0.2 s
+        """Return where Levenberg and Marquardt's method ends from a point, within the bounds.
 
+        Its normal equations are small: scipy's solver decomposes the whole Jacobian in each step, which took longer
+        than the rollouts of an arm.
+        """
         problem, table, config = self._problem, self._problem.table, self._problem.config
-        value, slope = problem.residuals.near(x, self._part)
-        first, J = value(x), slope(x)
-        if not (np.isfinite(first).all() and np.isfinite(J).all()):
+        there = problem.residuals.near(x, self._part, self._slopes)
+        free, near = self._part.present.copy(), max(_NEAR, problem.residuals.precision)
+
+        def normal(y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            """Return the robust residuals, half the gradient and half the second derivatives without the pull."""
+            r, stretch = robust(there.residuals(y), config.loss, config.reach)
+            J = stretch[:, None] * there.jacobian(y)
+            return r, J.T @ r, J.T @ J
+
+        r, g, H = normal(x)
+        if not (np.isfinite(r).all() and np.isfinite(H).all()):
             return x
         # End where no step can gain that share: steps that fail took 12 evaluations of each refit without a part.
-        r, stretch = robust(first, config.loss, config.reach)
-        basis = np.linalg.qr((stretch[:, None] * J * table.span)[:, self._part.present])[0]
-        left = r - basis @ (basis.T @ r)
-        if 1.0 - (left @ left) / max(float(r @ r), 1e-300) < gain:
+        step = bounded_step(H + 1e-12 * np.diag(table.span**-2), g, x, table, free)
+        if -(2.0 * g @ step + step @ H @ step) < gain * float(r @ r):
             return x
         # Pull to the nominal values by the residuals that the next step leaves, if the slope is right.
-        shape = (len(self._part.live), -1, len(problem.fields))
-        priors = sum(c.prior is not None for c in table.columns)
-        self._deviation = deviation(left[: len(left) - priors].reshape(shape), problem.residuals.compared(self._part))
-        rows, pull = np.flatnonzero(self._weight), self._deviation * self._weight
-
-        def pulled(y: np.ndarray) -> np.ndarray:
-            self._report(np.inf, y)
-            return np.nan_to_num(np.append(value(y), (pull * (y - self._nominal))[rows]), nan=np.inf)
-
-        def pulled_slope(y: np.ndarray) -> np.ndarray:
-            return np.vstack([slope(y), np.diag(pull)[rows]])
-
-        robustly: Any = {"loss": _LOSSES[config.loss], "f_scale": config.reach, "jac": pulled_slope, "gtol": None}
-        near, most = max(_NEAR, problem.residuals.precision), max(1, config.refine_steps)
-        bounds = (table.low, table.high)
-        end = least_squares(
-            pulled, x, bounds=bounds, x_scale=table.span, ftol=gain, xtol=near, max_nfev=most, **robustly
-        )
-        return np.asarray(end.x, np.float64)
+        shape, priors = (len(self._part.live), -1, len(problem.fields)), sum(c.prior is not None for c in table.columns)
+        stretch = robust(there.residuals(x), config.loss, config.reach)[1]
+        left = r + stretch * (there.jacobian(x) @ step)
+        compared = problem.residuals.compared(self._part)
+        self._deviation = deviation(left[: len(left) - priors].reshape(shape), compared)
+        pull, damping, failed, y = (self._deviation * self._weight) ** 2, _DAMPING, 0, x
+        cost = float(r @ r) + float(pull @ (y - self._nominal) ** 2)
+        for _ in range(max(1, config.refine_steps)):
+            G, A = g + pull * (y - self._nominal), H + np.diag(pull)
+            A = A + damping * np.diag(np.maximum(np.diag(A), 1e-9 * np.max(np.diag(A) * table.span**2) / table.span**2))
+            step = bounded_step(A, G, y, table, free)
+            predicted = -(2.0 * G @ step + step @ (H + np.diag(pull)) @ step)
+            raw = there.residuals(y + step)
+            self._report(np.inf, y + step)
+            new = robust(raw, config.loss, config.reach)[0]
+            after = float(new @ new) + float(pull @ (y + step - self._nominal) ** 2)
+            gained = cost - after if np.isfinite(after) else -np.inf
+            if not gained > 0.0:
+                if there.renew(y):
+                    r, g, H = normal(y)
+                    continue
+                damping, failed = damping * _HARDER, failed + 1
+                if np.max(np.abs(step) / table.span) < near or failed == _FAILED:
+                    break
+                continue
+            failed, damping = 0, max(damping * (_EASIER if gained > 0.5 * predicted else 1.0), _DAMPING * _EASIER)
+            y, cost = y + step, after
+            small = gained < gain * cost and gained > _AS_PREDICTED * predicted
+            if small or np.max(np.abs(step) / table.span) < near:
+                break
+            r, g, H = normal(y)
+        return y
 
     def _report(self, loss: float, x: np.ndarray) -> None:
         self.steps += 1
@@ -407,26 +472,8 @@ def with_terms(table: ParameterTable, x: np.ndarray, present: np.ndarray) -> np.
     return np.where(table.of_terms(present), x, off)
 
 
-def _roughly(problem: Problem, starts: np.ndarray, report: OnProgress | None) -> list[Refined]:
-    """Return the ends of rough descents without optional terms, and from the best one with all of them.
-
-    At nominal values the terms hide what the others explain, and each term makes a Jacobian larger.
-    """
-    table, residuals = problem.table, problem.residuals
-    none = np.zeros(len(table.terms), bool)
-    without = problem.part(present=table.of_terms(none))
-    begun = np.stack([with_terms(table, x, none) for x in starts])
-    first = _refine(problem, begun, report, residuals.liveliest(without))
-    first = _refine(problem, first.x[None], report, without)
-    return [first, _refine(problem, first.x[None], report, residuals.liveliest(problem.part()))]
-
-
-def _refine(problem: Problem, starts: np.ndarray, report: OnProgress | None, roughly: Part | None = None) -> Refined:
-    """Descend from starts.
-
-    Args:
-        roughly: Segments and parameters of a descent that only has to come near a minimum; None: to the minimum.
-    """
+def _refine(problem: Problem, starts: np.ndarray, report: OnProgress | None) -> Refined:
+    """Descend from starts to the minimum, with reports."""
     left, share = 1.0, 0.5 / (problem.config.refine_steps * (1 + len(starts)))
 
     def advance(best: float, x: np.ndarray) -> None:
@@ -436,6 +483,4 @@ def _refine(problem: Problem, starts: np.ndarray, report: OnProgress | None, rou
         if report:
             report("refine", step, best, x)
 
-    if roughly is None:
-        return refine(problem, starts, on_step=advance)
-    return refine(problem, starts, roughly, settle=False, gain=_ROUGHLY, on_step=advance)
+    return refine(problem, starts, on_step=advance)

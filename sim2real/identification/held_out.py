@@ -1,45 +1,36 @@
 """Parts of the recordings that are held out of a fit, one at a time: estimates without them, and their errors there.
 
 Around an estimate the loss of every part of the recordings is a quadratic function of the parameters, so the estimate
-without a part follows by linear algebra; a short descent ends there. Finished refits are stored in a file: a judgement
-that was ended goes on where it was. A refit is used again only for the same inputs: the file's digest covers logs,
-parameters and settings, and the model must still give the loss that the fit of all parts had.
+without a part follows by linear algebra; a short descent ends there.
 """
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 
-from sim2real.artifacts.files import read_json, write_json
-from sim2real.artifacts.identification import HeldOutPart, TriedTerm
-from sim2real.errors import Sim2RealError, UsageError
-from sim2real.identification.fit import Fit, refine, with_terms
+from sim2real.artifacts.identification import HeldOutPart
+from sim2real.errors import UsageError
+from sim2real.identification.fit import Fit, bounded_step, refine, with_terms
 from sim2real.identification.parameters import ParameterTable
 from sim2real.identification.predictions import labels
 from sim2real.identification.problem import Problem
-from sim2real.identification.residuals import Linearised, Part
+from sim2real.identification.residuals import Linearised
 from sim2real.identification.segments import Span, on_grid
 
-REFITS = "refits.json"
-"""File of finished refits."""
 MOST = 12
 """Most fits without parts."""
 MOVES = 10.0
 """Range of a joint's positions in motion, in deviations of a measurement."""
 _ROUNDING_S = 1e-6
 """Largest rounding error of a time."""
-_SAME = 3e-4
-"""Relative difference of two losses up to which two fits ended in one minimum."""
-_GAIN = 1e-3
-"""Relative gain of the loss at which a descent without a part ends."""
+_GAIN, _SLOPES = 1e-3, 1
+"""Relative gain of the loss at which a descent without a part ends; the Jacobians of a round that it computes, as it
+begins with that of all parts."""
 
 
 @dataclass(frozen=True)
@@ -139,34 +130,21 @@ class Statistics:
     prior: np.ndarray
     count: np.ndarray
 
-    def step(
-        self, table: ParameterTable, present: np.ndarray, held_out: np.ndarray | None = None, bounded: bool = False
-    ) -> np.ndarray:
+    def step(self, table: ParameterTable, present: np.ndarray, held_out: np.ndarray | None = None) -> np.ndarray:
         """Return the step to the estimate of a smaller model from all parts, or all but some, ``(P,)``.
 
         Args:
             present: Shape ``(T,)``, bool: the terms of the model.
             held_out: Shape ``(K,)``, bool: the held-out parts; None: all parts are used.
-            bounded: Whether parameters stop at their bounds, and the others are optimised with these values.
         """
         # Move the parameters of absent terms to their values without effect.
-        step, gone = with_terms(table, self.x, present) - self.x, ~table.of_terms(present)
+        gone = ~table.of_terms(present)
+        moved = np.where(gone, with_terms(table, self.x, present) - self.x, 0.0)
         # Sum the quadratic functions of the parts.
         g, H = self.gradient.sum(axis=0), self.information.sum(axis=0) + self.prior
         if held_out is not None:
             g, H = g - self.gradient[held_out].sum(axis=0), H - self.information[held_out].sum(axis=0)
-        # Solve for the other parameters; stop those that leave their bounds, and solve again.
-        for _ in range(len(self.x)):
-            rest = np.flatnonzero(~gone)
-            step[rest] = 0.0
-            step[rest] = -np.linalg.solve(H[np.ix_(rest, rest)], (g + H @ step)[rest])
-            end = self.x + step
-            beyond = ~gone & ((end < table.low) | (end > table.high))
-            if not bounded or not beyond.any():
-                break
-            step[beyond] = (np.clip(end, table.low, table.high) - self.x)[beyond]
-            gone |= beyond
-        return step
+        return moved + bounded_step(H, g + H @ moved, self.x, table, ~gone)
 
 
 def statistics(problem: Problem, at: Linearised, parts: np.ndarray) -> Statistics:
@@ -194,156 +172,43 @@ def on_held_out_parts(stats: Statistics, table: ParameterTable, present: np.ndar
     scores = []
     parts = np.arange(len(stats.value))
     for k in parts:
-        step = stats.step(table, present, parts == k, bounded=True)
+        step = stats.step(table, present, parts == k)
         square = stats.value[k] + 2.0 * stats.gradient[k] @ step + step @ stats.information[k] @ step
         scores.append(square / stats.count[k])
     return np.array(scores)
 
 
-@dataclass
-class Stored:
-    """The fit of a set of terms, and the estimates without parts.
-
-    Attributes:
-        x: The fit of all parts, ``(P,)``.
-        ends: Part -> the estimate without it, ``(P,)``.
-        tried: What further terms gain beside the set; empty: none was tried.
-    """
-
-    x: list[float]
-    loss: float
-    ends: dict[str, list[float]] = field(default_factory=dict)
-    tried: list[TriedTerm] = field(default_factory=list)
-
-
-@dataclass
-class StoredRefits:
-    """What the file holds: the digest of the inputs, and by set of terms the fits."""
-
-    digest: str
-    sets: dict[str, Stored] = field(default_factory=dict)
-
-
-class Refits:
-    """The finished refits of one identification; without a path they stay in memory.
-
-    Attributes:
-        reused: Number of refits that were used again.
-        source: The file that they are from; None: there is none of the same inputs.
-        stored: Whether the file was written.
-    """
-
-    def __init__(self, path: Path | None = None, digest: str = "", earlier: Iterable[Path] = ()) -> None:
-        self._path, self._document, self.reused = path, StoredRefits(digest), 0
-        self.source: Path | None = None
-        self.stored = False
-        self._lock = threading.Lock()
-        for file in earlier:
-            try:
-                document = read_json(file, StoredRefits)
-            except (Sim2RealError, ValueError, OSError, msgspec.MsgspecError):
-                continue  # an unreadable file costs time only: the refits are computed
-            if document.digest == digest and document.sets:
-                self._document, self.source = document, file
-                return
-
-    def whole(self, terms: Sequence[str], problem: Problem, part: Part) -> tuple[np.ndarray, float] | None:
-        """Return a stored fit of all parts and its loss; None if there is none, or the problem gives another loss."""
-        stored = self._document.sets.get(_key(terms))
-        if stored is None or not self._has_loss(np.array(stored.x), stored.loss, problem, part):
-            self._document.sets.pop(_key(terms), None)
-            return None
-        return np.array(stored.x), stored.loss
-
-    def begin(self, terms: Sequence[str], x: np.ndarray, loss: float) -> None:
-        """Store the fit of all parts. Estimates without parts stay if they were made for the same minimum."""
-        stored = self._document.sets.get(_key(terms))
-        if stored is None or not abs(loss - stored.loss) <= _SAME * abs(stored.loss):
-            self._document.sets[_key(terms)] = Stored(x.tolist(), loss)
-            self._write()
-
-    def end(self, terms: Sequence[str], part: str) -> np.ndarray | None:
-        """Return the stored estimate without a part; None: it was not computed."""
-        stored = self._document.sets.get(_key(terms))
-        if stored is None or part not in stored.ends:
-            return None
-        self.reused += 1
-        return np.array(stored.ends[part])
-
-    def store(self, terms: Sequence[str], part: str, x: np.ndarray) -> np.ndarray:
-        """Store the estimate without a part, and return it."""
-        self._document.sets[_key(terms)].ends[part] = x.tolist()
-        self._write()
-        return x
-
-    def tried(self, terms: Sequence[str], compute: Callable[[], Sequence[TriedTerm]]) -> tuple[TriedTerm, ...]:
-        """Return what further terms gain beside a set whose fit is stored; it is computed once."""
-        stored = self._document.sets[_key(terms)]
-        if not stored.tried:
-            stored.tried = list(compute())
-            self._write()
-        return tuple(stored.tried)
-
-    def _has_loss(self, x: np.ndarray, loss: float, problem: Problem, part: Part) -> bool:
-        if len(x) != len(problem.table):
-            return False
-        return abs(problem.loss(x, part) - loss) <= _SAME * abs(loss)
-
-    def close(self) -> None:
-        """Stop writing: a thread that still computes must not change a file of a stage that has ended."""
-        with self._lock:
-            self._path = None
-
-    def _write(self) -> None:
-        with self._lock:
-            if self._path is not None:
-                self.stored = True
-                write_json(self._path, self._document)
-
-
-def _key(terms: Sequence[str]) -> str:
-    return ",".join(terms)
-
-
-def leave_out(
-    estimate: Fit, parts: Sequence[Fold], settle_s: float, free_run_s: float = 0.0, refits: Refits | None = None
-) -> list[HeldOutPart]:
+def leave_out(estimate: Fit, parts: Sequence[Fold], settle_s: float, free_run_s: float = 0.0) -> list[HeldOutPart]:
     """Identify without each part, and predict that part.
-
-    No descent begins at the estimate of all parts, which includes this part: a refinement may end where it begins. It
-    begins at the linear prediction from the other parts.
 
     Args:
         parts: Held out one at a time.
         settle_s: First part of a prediction, to which its initial state is fitted [s].
         free_run_s: Longest free run [s]; 0 skips the free runs.
-        refits: Finished refits, which are not computed again.
     """
-    refits = refits or Refits()
-    refits.begin(estimate.problem.table.terms, estimate.x, estimate.loss)
-    problem, table, (groups, _) = estimate.problem, estimate.problem.table, shared(parts)
-    touched, every = masks(problem, groups), np.ones(len(table.terms), bool)
+    problem, groups = estimate.problem, shared(parts)[0]
+    touched, every = masks(problem, groups), np.ones(len(problem.table.terms), bool)
     stats = statistics(problem, problem.linearise(estimate.x), touched)
-    ends = []
-    for k, group in enumerate(groups):
-        start = stats.x + stats.step(table, every, np.arange(len(groups)) == k, bounded=True)
-        rest = problem.part(problem.train[touched[k]])
-        ends.append(refitted(refits, table.terms, group, problem, start, rest))
-    return predicted(estimate, parts, stats, every, ends, settle_s, free_run_s)
+    return predicted(estimate, parts, stats, every, refitted(problem, stats, touched, every), settle_s, free_run_s)
 
 
-def refitted(
-    refits: Refits, terms: Sequence[str], part: Fold, problem: Problem, start: np.ndarray, rest: Part
-) -> np.ndarray:
-    """Return the estimate without a part, ``(P,)``: a finished refit, or one from a start, which is then stored.
+def refitted(problem: Problem, stats: Statistics, touched: np.ndarray, present: np.ndarray) -> list[np.ndarray]:
+    """Return the estimates without each part, ``(P,)``.
+
+    No descent begins at the estimate of all parts, which includes this part: a refinement may end where it begins. It
+    begins at the linear prediction from the other parts.
 
     Args:
-        rest: The segments of the other parts.
+        stats: Of the parts.
+        touched: Shape ``(K, S)``, bool: the segments of each part.
+        present: Shape ``(T,)``, bool: the terms of the model.
     """
-    name = f"{part.name} {part.parts}"
-    if (stored := refits.end(terms, name)) is not None:
-        return stored
-    return refits.store(terms, name, refine(problem, start[None], rest, settle=False, gain=_GAIN).x)
+    table, ends = problem.table, list[np.ndarray]()
+    for k, segments in enumerate(touched):
+        start = stats.x + stats.step(table, present, np.arange(len(touched)) == k)
+        rest = problem.part(problem.train[segments], table.of_terms(present))
+        ends.append(refine(problem, start[None], rest, settle=False, gain=_GAIN, slopes=_SLOPES).x)
+    return ends
 
 
 def predicted(

@@ -190,8 +190,10 @@ class Residuals:
         self._table, self._config = rollouts.table, rollouts.config
         self._n, self._free = len(rollouts.prior), rollouts.config.initial_state == "free"
         self.precision = 1e-4 if self._free else 1e-5
-        apart = trees_are_apart(rollouts.engine.model)
+        apart, compiled = trees_are_apart(rollouts.engine.model), rollouts.engine.model is None
         self._groups: Groups = like._groups if like else Groups(apart)
+        # Joints of a compiled world may act on each other at other points: its groups are for steps alone.
+        self._step_groups: Groups = like._step_groups if like else Groups(True) if compiled else self._groups
         self._state_groups: Groups = like._state_groups if like else Groups(apart, by_tree=True)
         self._last_states: list[tuple[bytes, bool, _States]] = []
         self._last: list[tuple[np.ndarray, Part, Linearised, np.ndarray]] = []
@@ -232,11 +234,13 @@ class Residuals:
         rows = zip(raw, candidates, strict=True)
         return np.array([self._loss(robust(r, loss, reach)[0], self._prior(x), part) for r, x in rows])
 
-    def near(self, x: np.ndarray, part: Part) -> tuple[Stacked, Stacked]:
-        """Return functions of points ``(P,)`` near ``x`` for a descent; initial states keep their slopes at ``x``.
+    def near(self, x: np.ndarray, part: Part, slopes: int | None = None) -> Nearby:
+        """Return the residuals near ``x`` for a descent; initial states keep their slopes at ``x``.
 
-        The first returns the residuals ``(N,)`` without the robust loss, then those of the priors. The second returns
-        their Jacobian ``(N, P)`` at the last of these points, by one-sided differences, or corrected from step to step.
+        They are without the robust loss, and those of the priors follow; their Jacobian is by one-sided differences.
+
+        Args:
+            slopes: Most Jacobians that are computed; default: as many as the steps need.
         """
         states = self._fitted_states(x, part)
 
@@ -245,31 +249,13 @@ class Residuals:
 
         def slope(y: np.ndarray) -> np.ndarray:
             sign = np.where(y + self._step > self._table.high, -1.0, 1.0)
-            groups = self._groups.members(np.flatnonzero(part.present).tolist())
+            groups = self._step_groups.members(np.flatnonzero(part.present).tolist())
             moved = self._moved(y, groups, sign)
             raw = self._raw(np.concatenate([y[None], moved]), states, part)
-            J = self._groups.spread(raw[1:] - raw[0], groups, len(y)) / (sign * self._step)
+            J = self._step_groups.spread(raw[1:] - raw[0], groups, len(y)) / (sign * self._step)
             return np.concatenate([J.reshape(-1, len(y)), self._prior_slope(y)])
 
-        return corrected(value, slope, self._table.span, self._known_nearby(x, part))
-
-    def generations(self, part: Part) -> Callable[[np.ndarray, np.ndarray, bool], np.ndarray]:
-        """Return the losses of a search's generations, on the segments with most motion.
-
-        Generations of one middle share its initial states. Few segments suffice for a search: all 23 of an arm took 2.6
-        times as long.
-        """
-        few, states = self.liveliest(part), list[_States | None]([None])
-
-        def losses(candidates: np.ndarray, middle: np.ndarray, new: bool) -> np.ndarray:
-            if new:
-                states[0] = self._fitted_states(middle, few)
-            raw = self._raw(candidates, states[0], few)
-            loss, reach = self._config.loss, self._config.reach
-            rows = zip(raw, candidates, strict=True)
-            return np.array([self._loss(robust(r, loss, reach)[0], self._prior(x), few) for r, x in rows])
-
-        return losses
+        return Nearby(value, slope, self._table.span, self._known_nearby(x, part), slopes)
 
     def predict(
         self, values: Mapping[str, Any], segments: np.ndarray, fit_s: np.ndarray
@@ -288,17 +274,9 @@ class Residuals:
             errors = self.errors(arrays, segments, still)
         return errors, self._rollouts.starts(arrays, segments, still, self._data)
 
-    def with_values(self, x: np.ndarray, rows: np.ndarray, part: Part) -> np.ndarray:
-        """Return the robust residuals ``(G, S, K, F)`` with other values of some parameters, ``(G, P)``.
-
-        Args:
-            x: Shape ``(P,)``: the parameters; initial states are linearised there.
-            rows: Values; NaN keeps the value at ``x``.
-        """
-        values = self._table.decode(np.repeat(x[None], len(rows), axis=0), part.present)
-        for i, c in enumerate(self._table.columns):
-            values[c.name] = np.where(np.isnan(rows[:, i]), values[c.name], rows[:, i])
-        raw = self._projected(values, self._fitted_states(x, part, fresh=True), part)
+    def robustly(self, points: np.ndarray, x: np.ndarray, part: Part) -> np.ndarray:
+        """Return the robust residuals ``(N, S, K, F)`` at points ``(N, P)``; initial states are linearised at ``x``."""
+        raw = self._raw(points, self._fitted_states(x, part, fresh=True), part)
         return robust(raw, self._config.loss, self._config.reach)[0]
 
     def liveliest(self, part: Part, most: int | None = None) -> Part:
@@ -501,41 +479,69 @@ def robust(raw: np.ndarray, loss: Loss, reach: float) -> tuple[np.ndarray, np.nd
     return raw * share, 1.0 / ((1.0 + square) * share)
 
 
-def corrected(
-    value: Stacked,
-    slope: Stacked,
-    scale: np.ndarray | float = 1.0,
-    nearby: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
-) -> tuple[Stacked, Stacked]:
-    """Return the functions of a descent whose Jacobian is corrected after each step, and computed again if that fails.
+class Nearby:
+    """Residuals near a point, and their Jacobian, which is corrected after each step, and computed again if that fails.
 
     Broyden's rank-one correction is exact along the last step (Math. Comp. 19, 1965).
 
     Args:
         value: Residuals ``(N,)`` at a point ``(P,)``.
-        slope: Their Jacobian ``(N, P)``, at the point of the last residuals.
+        slope: Their Jacobian ``(N, P)``.
         scale: Shape ``(P,)``: length of a step of each parameter that counts as much as one of another.
-        nearby: A point nearby, the residuals and the Jacobian there, which is corrected for the first point, too.
+        known: A point nearby, the residuals and the Jacobian there, which is corrected for the first point, too.
+        most: Most Jacobians that are computed; then each is corrected. Default: as many as needed.
     """
-    last: list[tuple[np.ndarray, np.ndarray]] = []  # the point of the last evaluation, and the residuals there
-    accepted = [] if nearby is None else [nearby]  # that of the last step
 
-    def evaluated(y: np.ndarray) -> np.ndarray:
-        if not (last and np.array_equal(last[0][0], y)):
-            last[:] = [(y.copy(), value(y))]
-        return last[0][1]
+    def __init__(
+        self,
+        value: Stacked,
+        slope: Stacked,
+        scale: np.ndarray | float = 1.0,
+        known: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
+        most: int | None = None,
+    ) -> None:
+        self._value, self._slope, self._scale = value, slope, scale
+        self._last: tuple[np.ndarray, np.ndarray] | None = None  # the point of the last evaluation, and the residuals
+        self._known, self._left, self._computed = known, np.inf if most is None else most, False
 
-    def differentiated(y: np.ndarray) -> np.ndarray:
-        r = evaluated(y)
-        J = slope(y) if not accepted else _updated(*accepted[0], y, r, scale)
-        accepted[:] = [(y.copy(), r, slope(y) if J is None else J)]
-        return accepted[0][2]
+    def residuals(self, y: np.ndarray) -> np.ndarray:
+        """Return the residuals at a point."""
+        if self._last is None or not np.array_equal(self._last[0], y):
+            self._last = (y.copy(), self._value(y))
+        return self._last[1]
 
-    return evaluated, differentiated
+    def jacobian(self, y: np.ndarray) -> np.ndarray:
+        """Return the Jacobian at the point of a step, or at the point of the last one."""
+        if self._known is not None and np.array_equal(self._known[0], y):
+            return self._known[2]
+        r, J = self.residuals(y), None
+        if self._known is not None:
+            J = _updated(*self._known, y, r, self._scale, _TRUSTED if self._left > 0 else np.inf)
+        self._computed = J is None
+        self._known = (y.copy(), r, self._compute(y) if J is None else J)
+        return self._known[2]
+
+    def renew(self, y: np.ndarray) -> bool:
+        """Compute the Jacobian at the point of the last step; return False if that was done, or may not be."""
+        if self._computed or self._left <= 0:
+            return False
+        self._computed = True
+        self._known = (y.copy(), self.residuals(y), self._compute(y))
+        return True
+
+    def _compute(self, y: np.ndarray) -> np.ndarray:
+        self._left -= 1
+        return self._slope(y)
 
 
 def _updated(
-    point: np.ndarray, before: np.ndarray, J: np.ndarray, y: np.ndarray, r: np.ndarray, scale: np.ndarray | float
+    point: np.ndarray,
+    before: np.ndarray,
+    J: np.ndarray,
+    y: np.ndarray,
+    r: np.ndarray,
+    scale: np.ndarray | float,
+    trusted: float,
 ) -> np.ndarray | None:
     """Return the corrected Jacobian after a step; None if the old one did not predict the step."""
     step = y - point
@@ -545,6 +551,6 @@ def _updated(
     length = float(step @ direction)
     if length == 0.0:
         return J
-    if not np.linalg.norm(missed) <= _TRUSTED * np.linalg.norm(expected):
+    if not np.linalg.norm(missed) <= trusted * np.linalg.norm(expected):
         return None
     return J + np.outer(missed, direction / length)

@@ -26,7 +26,7 @@ from sim2real.types import Array, MjModel, PyTree, Scalar
 from sim2real.worlds import rollouts as physics
 
 _NEEDED = ("open_loop", "fields", "start", "controls", "message")
-_ON_C, _COMPILED = (24, 128, 512), (32, 256)
+_ON_C, _COMPILED = (4, 24, 128, 512), (32, 256)
 """Copies in one call of a program. C: a Jacobian of 20 logs took 24 s of processor time with 128 at a time, 18 s with
 512. Compiled: each size is a program that contains the physics."""
 
@@ -216,7 +216,7 @@ class Rollouts:
     ) -> np.ndarray:
         """Return initial states ``(N, 2 * channels)``: positions, then velocities; arguments as in ``errors``."""
         program = self._program("starts", lambda v, e, s, data: self._started(v, e, s, data)[1], (0, 0, 0, None))
-        size = -(-len(segment) // _ON_C[0]) * _ON_C[0]
+        size = -(-len(segment) // _ON_C[1]) * _ON_C[1]
         copies = padded(_single((dict(values), segment, shift * self.prior)), size)
         return np.asarray(program(*copies, data), np.float64)[: len(segment)]
 

@@ -19,8 +19,8 @@ from sim2real.errors import Sim2RealError, UsageError
 from sim2real.identification.config import FitConfig
 from sim2real.types import Array, PyTree
 
-Losses = Callable[[np.ndarray, np.ndarray, bool], np.ndarray]
-"""Candidates ``(N, P)``, the middle of their generation ``(P,)`` and whether that middle is new -> losses ``(N,)``."""
+Losses = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Candidates ``(N, P)`` and the middle of their block of generations ``(P,)`` -> losses ``(N,)``."""
 _BLOCK = 10
 """Generations with one middle, after which the search decides whether to continue."""
 _NARROW = 0.02
@@ -92,7 +92,7 @@ def search(
     for generation in range(config.generations):
         key, k_ask, k_tell = jax.random.split(key, 3)
         # Losses of a block are computed with initial states that are linearised at its first middle.
-        if new := generation % _BLOCK == 0:
+        if generation % _BLOCK == 0:
             middle = inside(np.asarray(strategy.get_mean(state), np.float64))
         candidates, state = ask(k_ask, state, params)
         spread = np.asarray(candidates, np.float64)
@@ -103,7 +103,7 @@ def search(
                 hint="try another population, or CMA_ES",
             )
         points = inside(spread)
-        fitness = np.asarray(losses(points, middle, new), np.float64)
+        fitness = np.asarray(losses(points, middle), np.float64)
         fitness = np.where(np.isfinite(fitness), fitness, _INFINITE)
         state, _ = tell(k_tell, candidates, jnp.asarray(fitness, jnp.float32), state, params)
         if fitness.min() < loss:
@@ -247,7 +247,7 @@ def minimise(
     every = lambda c: np.asarray(program(jnp.asarray(c, jnp.float32)))  # noqa: E731
     losses = every if compiled else lambda c: np.array([number(z) for z in c])
     first = float(losses(np.stack([begin] * config.population))[0] if compiled else number(begin))
-    result = search(lambda candidates, middle, new: losses(candidates), begin, scale.low, scale.high, config)
+    result = search(lambda candidates, middle: losses(candidates), begin, scale.low, scale.high, config)
 
     # Keep the start if the search finds nothing better.
     better = result.loss < first or not np.isfinite(first)

@@ -14,7 +14,7 @@ from sim2real.graph.episode import Episode
 from sim2real.graph.node import TICKS_PER_S, BaseNode, to_ticks
 from sim2real.graph.timeline import Timeline
 from sim2real.graph.times import Edge, Vertex
-from sim2real.identification.model import ChecksLogs, IdentifiableModel
+from sim2real.identification.model import ChecksLogs, IdentifiableModel, position_of
 from sim2real.later import jnp
 from sim2real.types import Array, PyTree
 
@@ -288,77 +288,35 @@ def _local_fit(episode: Episode, model: IdentifiableModel, begin_s: float) -> np
 _RESTS = 10.0
 """Range of the positions of a joint that never moves, in deviations of a measurement."""
 _RATE_S = 0.05
-"""Time over which a speed is averaged for the range of a signal [s]: noise of 1 mrad makes 28 mrad/s."""
-Signal = tuple[float, float]
-"""Smallest and largest value of a signal."""
-_MOST_BEYOND = 6
-"""Most sentences about signals outside their fitted range."""
+"""Time over which a speed is averaged for the range of a motion [s]: noise of 1 mrad makes 28 mrad/s."""
+Extent = tuple[float, float, float]
+"""Lowest and highest position, and largest speed."""
 
 
-def range_of(signals: Mapping[str, Signal], column: str, before: str = "") -> Signal:
-    """Return the range of a measured position; the only entry of a field has no index in its label."""
-    names = [f"{before}{name!r} of " for name in (column, column.removesuffix("[0]"))]
-    return next((r for name in names for label, r in signals.items() if label.startswith(name)), (0.0, 0.0))
-
-
-def speed_range_of(signals: Mapping[str, Signal], column: str) -> Signal:
-    """Return the range of a measured position's speed."""
-    return range_of(signals, column, "the speed of ")
-
-
-def ranges(
+def extents(
     model: IdentifiableModel, recordings: Sequence[Episode], spans: Sequence[Span], length_s: float
-) -> dict[str, Signal]:
-    """Return the range of each signal in some segments: commands, measured positions, and their speeds.
+) -> dict[str, Extent]:
+    """Return column -> extent of the motion of each measured position in some segments.
 
     Args:
         length_s: Length of a segment [s].
     """
-    fields = [(n, f) for n, tree in model.given.items() for f in pytree.leaves(tree)]
-    positions = list(dict.fromkeys(c.position for c in model.channels))
-    ends: dict[str, list[np.ndarray]] = {}
-    for node, name in [*fields, *((model.sensor, f) for f in positions)]:
+    found = {}
+    for c in model.channels:
+        rows = []
         for span in spans:
-            t = recordings[span.recording].steps[node].begun_s
+            t = recordings[span.recording].steps[model.sensor].begun_s
             inside = (t >= span.begin_s) & (t <= span.begin_s + length_s)
             if not inside.any():
                 continue
-            rows = recordings[span.recording].outputs[node][name][inside].reshape(int(inside.sum()), -1)
-            signals = {f"{name!r} of {node!r}": rows}
-            if node == model.sensor and np.ptp(t[inside]) > 2 * _RATE_S:
-                signals[f"the speed of {name!r} of {node!r}"] = rates(t[inside], rows)
-            for label, values in signals.items():
-                ends.setdefault(label, []).append(np.stack([values.min(axis=0), values.max(axis=0)]))
-    extents = {}
-    for label, pairs in ends.items():
-        low, high = np.min([e[0] for e in pairs], axis=0), np.max([e[1] for e in pairs], axis=0)
-        for i, both in enumerate(zip(low.tolist(), high.tolist(), strict=True)):
-            extents[label if low.size == 1 else label.replace("' of", f"[{i}]' of", 1)] = both
-    return extents
-
-
-def rates(t: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return mean speeds over ``_RATE_S`` of positions ``(N, F)`` at times ``(N,)`` [s]."""
-    grid = np.arange(t[0], t[-1], _RATE_S)
-    return np.stack([np.diff(np.interp(grid, t, column)) / _RATE_S for column in rows.T], axis=1)
-
-
-def beyond(fitted: Mapping[str, Signal], held_out: Mapping[str, Signal], share: float = 0.1) -> list[str]:
-    """Return sentences about signals that leave the range of the fitted segments: the model extrapolates.
-
-    Args:
-        fitted: Result of ``ranges``.
-        share: Smallest excess that is reported, as a share of the fitted range.
-    """
-    messages = []
-    for label in fitted.keys() & held_out.keys():
-        (low, high), (lowest, highest) = fitted[label], held_out[label]
-        room = share * (high - low) + 1e-9 * abs(high)
-        if lowest < low - room or highest > high + room:
-            excess = max(low - lowest, highest - high) / max(high - low, 1e-300)
-            text = f"{label} reaches [{lowest:.3g}, {highest:.3g}], fitted was [{low:.3g}, {high:.3g}]"
-            messages.append((excess, text))
-    return [text for _, text in sorted(messages, reverse=True)[:_MOST_BEYOND]]
+            position = c.of(recordings[span.recording].outputs[model.sensor][c.position][inside])
+            grid = np.arange(t[inside][0], t[inside][-1], _RATE_S)
+            speeds = np.diff(np.interp(grid, t[inside], position)) / _RATE_S
+            rows.append((position.min(), -position.max(), -np.max(np.abs(speeds), initial=0.0)))
+        if rows:
+            low, high, fastest = np.min(rows, axis=0).tolist()
+            found[position_of(c)] = (low, -high, -fastest)
+    return found
 
 
 _EXACT = 4

@@ -1,9 +1,9 @@
 """Optional terms of a model, chosen by forward selection on held-out parts.
 
-Each round fits the model with one further term, or a pair, that the quadratic approximation around the present model
-proposes, and keeps the one whose errors on held-out parts fall most, until none falls by a tenth. The estimates without
-a part are linear steps for the candidates, and refits for the best of them. What a model lacks is found by one such
-round.
+Each round fits the model with one further term, or a pair, for which linear algebra around the present model predicts
+smaller errors on held-out parts, and keeps the one whose errors fall most, until none falls by a tenth. The estimates
+without a part are linear steps for the candidates, and refits for the best of them. What a model lacks is found by one
+such round.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -15,10 +15,11 @@ import numpy as np
 from sim2real.artifacts.identification import HeldOutPart, Outcome, TriedTerm
 from sim2real.identification import held_out
 from sim2real.identification.fit import Fit, refine, with_terms
-from sim2real.identification.held_out import Fold, Refits, Statistics, on_held_out_parts, statistics
+from sim2real.identification.held_out import Fold, Statistics, on_held_out_parts, statistics
 from sim2real.identification.parameters import ParameterTable
 from sim2real.identification.predictions import labels
 from sim2real.identification.problem import MOST_OF_SETS, thinned
+from sim2real.identification.residuals import Linearised, Part
 from sim2real.identification.uncertainty import above_noise
 
 ALIKE = 1.1
@@ -27,9 +28,15 @@ _FAR = 1.5
 """Ratio of the errors in free runs above which a further term harms."""
 _LITTLE = 0.01
 """Share of the loss below which a further term gains too little."""
-_LEVELS, _ACTS, _LOWER = 16, 1e-4, 2
-"""Levels of a limit that are simulated; relative change of the loss from which it acts; the second start's number of
-levels below the first."""
+_PROMISING = 0.95
+"""Ratio of the error that linear algebra predicts with a further term to that without it, above which it is not
+fitted."""
+MENDS = 0.5
+"""Ratio of the errors on held-out parts from which on a model lacks a term."""
+_LEVELS, _LOWER = 16, 2
+"""Levels of a limit that are simulated; the second start's number of levels below the first."""
+_DIVERGED = 1e9
+"""Residual of a simulation that diverges [deviations of a measurement]."""
 _LIMITED = 2.0
 """Ratio of residuals to noise from which limits are tried: one that acts leaves far more, and its fit takes long."""
 _TRIED = 3
@@ -71,10 +78,19 @@ class Trial:
         """Root mean square of the errors on held-out parts [deviations of a measurement]."""
         return float(np.sqrt(np.nan_to_num(self.ahead, nan=np.inf).mean()))
 
+    @property
+    def free_error(self) -> float:
+        """The same in free runs."""
+        return float(np.sqrt(np.nan_to_num(self.free, nan=np.inf).mean()))
+
     def is_better_than(self, other: "Trial") -> bool:
         """Return whether the errors on held-out parts are clearly smaller, and those in free runs not far larger."""
-        free, before = (float(np.sqrt(np.nan_to_num(t.free, nan=np.inf).mean())) for t in (self, other))
-        return self.error * ALIKE < other.error and not free > _FAR * before
+        return self.error * ALIKE < other.error and not self.free_error > _FAR * other.free_error
+
+    def mends(self, other: "Trial") -> bool:
+        """Return whether the errors on held-out parts, or those in free runs, are below half of another set's."""
+        halves = self.error < MENDS * other.error or self.free_error < MENDS * other.free_error
+        return halves and self.error < other.error and not self.free_error > _FAR * other.free_error
 
 
 @dataclass(frozen=True)
@@ -93,7 +109,6 @@ class TermSearch:
         parts: Held out one at a time.
         settle_s: First part of a prediction, to which its initial state is fitted [s].
         free_run_s: Longest free run [s]; 0 skips the free runs.
-        refits: Finished refits.
         on_set: Called with the names of each set before it is fitted.
     """
 
@@ -103,11 +118,10 @@ class TermSearch:
         parts: Sequence[Fold],
         settle_s: float,
         free_run_s: float,
-        refits: Refits | None = None,
         on_set: Callable[[str], None] = lambda names: None,
     ) -> None:
         self._estimate, self._parts, self._times = estimate, parts, (settle_s, free_run_s)
-        self._refits, self._on_set = refits or Refits(), on_set
+        self._on_set = on_set
         self._groups = held_out.shared(parts)[0]
         self._problem = thinned(estimate.problem, held_out.masks(estimate.problem, self._groups), MOST_OF_SETS)
         self._masks = held_out.masks(self._problem, self._groups)
@@ -138,43 +152,61 @@ class TermSearch:
         return Selection(chosen, tuple(trials))
 
     def further(self, x: np.ndarray, present: np.ndarray) -> Selection:
-        """Return the fit of a set of terms beside its fits with one further term.
+        """Return the fits of a set of terms and of one further term each; chosen is a set that halves the errors.
 
         Args:
-            x: Shape ``(P,)``: an estimate with the set, where its fit begins.
+            x: Shape ``(P,)``: the estimate with the set.
             present: Shape ``(T,)``, bool: the terms of the set.
         """
-        base = self._attempt(present, [x], np.inf)
-        return Selection(base, (base, *self._round(base, pairs=False)))
+        base = self._trial(present, x, self._problem.loss(x, self._part(present)))
+        trials = self._round(base, pairs=False)
+        mending = [t for t in trials if t.mends(base)]
+        return Selection(min(mending, key=lambda t: t.error, default=base), (base, *trials))
+
+    def _part(self, present: np.ndarray) -> Part:
+        return self._problem.part(present=self._problem.table.of_terms(present))
 
     def _round(self, base: Trial, pairs: bool = True) -> list[Trial]:
         """Return the fits with one further term, or two, that may help most, and with each limit that may act."""
         table = self._problem.table
-        stats = statistics(self._problem, self._problem.linearise(base.x), self._masks)
+        at = self._problem.linearise(base.x)
+        around = [statistics(self._problem, at, self._masks)]
+        # A friction that the present model does not need may be needed beside another term; near 0 it has no slope.
+        small = np.array([c.vanishes and c.transform == "log" for c in table.columns])
+        small &= table.of_terms(base.present) & (base.x < table.start() - 1.0)
+        if small.any():
+            raised = np.where(small, table.start(), base.x)
+            around.append(statistics(self._problem, self._problem.linearise(raised), self._masks))
         trials = []
-        for present in _proposed(stats, table, base.present, pairs):
-            begin = stats.x + stats.step(table, present, bounded=True)
-            trials.append(self._attempt(present, [begin, base.x], base.loss))
+        for present in _proposed(around, table, base.present, pairs):
+            begins = [stats.x + stats.step(table, present) for stats in around]
+            trials.append(self._attempt(present, [*begins, base.x], base.loss))
         limits = np.flatnonzero(table.of_limits() & ~base.present) if base.above > _LIMITED else []
         for i in limits:
             present = base.present | (np.arange(len(base.present)) == i)
-            if starts := self._limited(base, present):
+            if starts := self._limited(base, at, present):
                 trials.append(self._attempt(present, starts, base.loss))
         return trials
 
-    def _limited(self, base: Trial, present: np.ndarray) -> list[np.ndarray]:
-        """Return starts for a set with one more limit: the best level that acts, and a lower one; none if none acts."""
+    def _limited(self, base: Trial, at: Linearised, present: np.ndarray) -> list[np.ndarray]:
+        """Return starts for a set with one more limit: the level that promises most, and a lower one; or none.
+
+        At each level the residuals are simulated; the other parameters follow by linear algebra.
+
+        Args:
+            at: The present model, with the derivatives by its parameters.
+        """
         problem, table = self._problem, self._problem.table
-        new = table.of_terms(present) & ~table.of_terms(base.present)
-        x = np.repeat(base.x[None], _LEVELS + 1, axis=0)
+        new, own = table.of_terms(present) & ~table.of_terms(base.present), table.of_terms(base.present)
         shares = np.linspace(1.0, _INSIDE, _LEVELS + 1)[:, None]
-        x[:, new] = (table.low + shares * table.span)[:, new]
-        losses = problem.losses(x, base.x, problem.part(present=table.of_terms(present)))
-        losses = np.nan_to_num(losses, nan=np.inf)
-        acts = np.flatnonzero(np.abs(losses / losses[0] - 1.0) > _ACTS)
-        if not len(acts):
+        x = np.where(new, table.low + shares * table.span, base.x)
+        limited = problem.residuals.robustly(x, base.x, self._part(present)).reshape(_LEVELS + 1, -1)
+        limited = np.nan_to_num(limited, nan=_DIVERGED)
+        basis = np.linalg.qr((at.jacobian * table.span).reshape(-1, len(table))[:, own])[0]
+        errors = np.linalg.norm(limited - limited @ basis @ basis.T, axis=1)
+        best = int(np.argmin(errors))
+        if not errors[best] < _PROMISING * errors[0]:
             return []
-        best = int(acts[np.argmin(losses[acts])])
         return [x[i] for i in (best, min(best + _LOWER, _LEVELS))]
 
     def _attempt(self, present: np.ndarray, starts: Sequence[np.ndarray], most: float) -> Trial:
@@ -186,8 +218,6 @@ class TermSearch:
         problem, table = self._problem, self._problem.table
         part, names = problem.part(present=table.of_terms(present)), self._names(present)
         self._on_set(", ".join(names) or "no term")
-        if stored := self._refits.whole(names, problem, part):
-            return self._trial(present, *stored)
         starts = [with_terms(table, x, present) for x in starts]
         order = np.argsort(np.nan_to_num([problem.loss(x, part) for x in starts], nan=np.inf))
         ended = refine(problem, starts[order[0]][None], part, coarse=True)
@@ -198,28 +228,17 @@ class TermSearch:
 
     def _judged(self, trial: Trial) -> Trial:
         """Return a trial whose fit ended, with its errors by refits without each part."""
-        problem, names = self._problem, self._names(trial.present)
-        part = problem.part(present=problem.table.of_terms(trial.present))
-        x, loss = trial.x, trial.loss
-        if not self._refits.whole(
-            names, problem, part
-        ):  # to the end, as each refit would have to descend that far, too
-            further = refine(problem, x[None], part, settle=False)
-            x, loss = further.x, further.loss
-        self._refits.begin(names, x, loss)
-        return replace(self._trial(trial.present, x, loss, refit=True), present=trial.present)
+        # To the end, as each refit would have to descend that far, too.
+        further = refine(self._problem, trial.x[None], self._part(trial.present), settle=False)
+        return replace(self._trial(trial.present, further.x, further.loss, refit=True), present=trial.present)
 
     def _trial(self, present: np.ndarray, x: np.ndarray, loss: float, refit: bool = False) -> Trial:
         """Return the trial of a fit, with errors by refits, or by linear steps."""
         problem, columns = self._problem, self._problem.table.of_terms(present)
         at = problem.linearise(x, problem.part(present=columns))
         stats = statistics(problem, at, self._masks)
-        ends = list(self._without_each(x, stats, present))
-        if refit:
-            names = self._names(present)
-            rest = [problem.part(problem.train[touched], columns) for touched in self._masks]
-            rows = zip(self._groups, ends, rest, strict=True)
-            ends = [held_out.refitted(self._refits, names, group, problem, end, one) for group, end, one in rows]
+        ends = held_out.refitted(problem, stats, self._masks, present) if refit else None
+        ends = list(self._without_each(x, stats, present)) if ends is None else ends
         rows = held_out.predicted(self._estimate, self._parts, stats, present, ends, *self._times)
         ahead, free = (np.array([self._mean_square(errors) for errors in kind]) for kind in (
             [row.ahead for row in rows], [row.free for row in rows]))  # fmt: skip
@@ -228,12 +247,10 @@ class TermSearch:
     def _without_each(self, x: np.ndarray, stats: Statistics, present: np.ndarray) -> np.ndarray:
         """Return the estimates without each group, ``(G, P)``: linear steps, shorter where a full one does not help."""
         problem, table, count = self._problem, self._problem.table, len(self._groups)
-        steps = np.array([stats.step(table, present, np.arange(count) == g, bounded=True) for g in range(count)])
+        steps = np.array([stats.step(table, present, np.arange(count) == g) for g in range(count)])
         points = table.within(x + np.concatenate([share * steps for share in _SHARES]))
         # Simulate all candidates at a time, and compare each on the segments of the other groups.
-        part = problem.part(present=table.of_terms(present))
-        rows = np.where(table.of_terms(present), table.unscale(points), np.nan)
-        residuals = problem.residuals.with_values(x, rows, part)
+        residuals = problem.residuals.robustly(points, x, self._part(present))
         squares = np.nan_to_num(np.sum(residuals**2, axis=(2, 3)), nan=np.inf)
         best = [
             min(range(k, len(points), count), key=lambda g, t=touched: float(squares[g][~t].sum()))
@@ -250,22 +267,33 @@ class TermSearch:
         return float(np.mean(squares)) if squares else 0.0
 
 
-def _proposed(stats: Statistics, table: ParameterTable, present: np.ndarray, pairs: bool) -> list[np.ndarray]:
+def _proposed(
+    around: Sequence[Statistics], table: ParameterTable, present: np.ndarray, pairs: bool
+) -> list[np.ndarray]:
     """Return larger sets in the order in which they are fitted, ``(T,)`` each, by their predicted errors.
 
-    The first has one further term. The others have two, if that is clearly better, or another one.
+    The first has one further term. The others have two, if that is clearly better, or another one. Sets that promise
+    less than 5 % are left out.
+
+    Args:
+        around: The loss around one point, or several: a set counts by the point from which it gains most.
     """
     absent, place = np.flatnonzero(~present & ~table.of_limits()), np.arange(len(present))
 
+    def error(one: np.ndarray, stats: Statistics) -> float:
+        return float(np.sqrt(np.maximum(on_held_out_parts(stats, table, one).mean(), 1e-300)))
+
     def ordered(count: int) -> list[tuple[float, np.ndarray]]:
         sets = [present | np.isin(place, more) for more in combinations(absent, count)]
-        errors = [float(np.sqrt(np.maximum(on_held_out_parts(stats, table, one).mean(), 0.0))) for one in sets]
-        return sorted(zip(errors, sets, strict=True), key=lambda pair: pair[0])
+        shares = [min(error(one, s) / before for s, before in zip(around, now, strict=True)) for one in sets]
+        rated = sorted(zip(shares, sets, strict=True), key=lambda pair: pair[0])
+        return [pair for pair in rated if pair[0] < _PROMISING]
 
-    if not (ones := ordered(1)):
-        return []
-    twos = [pair for pair in (ordered(2)[:1] if pairs else []) if pair[0] * ALIKE < ones[0][0]]
-    return [one for _, one in [ones[0], *twos, *ones[1:]]][:_TRIED]
+    now = [error(present, stats) for stats in around]
+    ones = ordered(1)
+    best = ones[0][0] if ones else 1.0
+    twos = [pair for pair in (ordered(2)[:1] if pairs else []) if pair[0] * ALIKE < best]
+    return [one for _, one in [*ones[:1], *twos, *ones[1:]]][:_TRIED]
 
 
 def gains(selection: Selection, table: ParameterTable) -> tuple[TriedTerm, ...]:
@@ -274,7 +302,7 @@ def gains(selection: Selection, table: ParameterTable) -> tuple[TriedTerm, ...]:
     A term's gain is the difference of the errors of two sets that differ by this term. If there are several such pairs,
     the one closest to the chosen set counts.
     """
-    rows, chosen, limits = [], selection.chosen, table.of_limits()
+    rows, chosen = [], selection.chosen
     for i, term in enumerate(table.terms):
         one = np.arange(len(table.terms)) == i
         pairs = [
@@ -284,7 +312,7 @@ def gains(selection: Selection, table: ParameterTable) -> tuple[TriedTerm, ...]:
             if not without.present[i] and np.array_equal(with_it.present, without.present | one)
         ]
         if not pairs:
-            missing: Outcome = "chosen" if chosen.present[i] else "not reached" if limits[i] else "not fitted"
+            missing: Outcome = "chosen" if chosen.present[i] else "not fitted"
             rows.append(TriedTerm(term, chosen.error, None, missing))
             continue
         off = [int(np.sum((with_it.present ^ chosen.present) & ~one)) for with_it, _ in pairs]

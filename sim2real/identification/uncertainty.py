@@ -45,6 +45,8 @@ _DISAGREES = 0.01
 _ORDER, _GAIN = 3, 20.0
 """Differences of this order remove slow changes, such as the errors of a model; the variance of those of white noise of
 variance 1: 1 + 9 + 9 + 1."""
+_FLOOR = 0.1
+"""Smallest noise, in assumed deviations of a measurement: simulated logs have none, and residuals of integrators."""
 _MULTIPLES = 0.98
 """Share of the differences between readings that must be multiples of a quantum."""
 
@@ -376,9 +378,8 @@ def widening(at: Linearised, spread: Uncertainty) -> float:
     parameters. With this factor, the predictions of draws spread on average as widely as slow residuals. White noise of
     the measurement does not count. Without slow residuals the factor is 1.
     """
-    raw = at.raw.transpose(0, 2, 1)  # (S, F, C): one row a field of a segment
-    inside = np.broadcast_to(at.compared[:, None], raw.shape)
-    total, white, count = _squares(raw, at.compared)
+    inside = np.broadcast_to(at.compared[:, None], at.raw.transpose(0, 2, 1).shape)
+    total, white, count = (each.sum() for each in _squares(at))
     slow = max(0.0, total - white) / count if count else 0.0
     # Compare it with the spread of the predictions.
     J = at.jacobian.transpose(0, 2, 1, 3)[inside]
@@ -387,30 +388,27 @@ def widening(at: Linearised, spread: Uncertainty) -> float:
 
 
 def above_noise(at: Linearised) -> float:
-    """Return the ratio of the residuals to the noise of the sensor, which no model predicts."""
-    total, white, _ = _squares(at.raw.transpose(0, 2, 1), at.compared)
-    return float(np.sqrt(total / white)) if white > 0.0 else np.inf
+    """Return the largest ratio of a field's residuals to the noise of the sensor, which no model predicts."""
+    total, white, count = _squares(at)
+    if not count.any():
+        return np.inf
+    return float(np.sqrt(np.max(total / np.maximum(white, _FLOOR**2 * np.maximum(count, 1)))))
 
 
-def _squares(raw: np.ndarray, compared: np.ndarray) -> tuple[float, float, int]:
-    """Return the sum of squares of residuals ``(S, F, C)``, the share of white noise in it, and their number.
+def _squares(at: Linearised) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the sum of squares of each field's residuals, the share of white noise in it, and their number, ``(F,)``.
 
-    In each field third differences separate white noise from slow errors.
-
-    Args:
-        compared: Shape ``(S, C)``, bool: which residuals count.
+    Third differences separate white noise from slow errors.
     """
-    total, noise, count = 0.0, 0.0, 0
-    for field in range(raw.shape[1]):
-        rows = [r[counts] for r, counts in zip(raw[:, field], compared, strict=True)]
-        rows = [r for r in rows if r.size > _ORDER]
-        if not rows:
-            continue
-        white = float(np.mean(np.concatenate([np.diff(r, _ORDER) for r in rows]) ** 2)) / _GAIN
-        squares = np.concatenate(rows) ** 2
-        total, count = total + float(squares.sum()), count + squares.size
-        noise += min(white, float(squares.mean())) * squares.size
-    return total, noise, count
+    rows = np.zeros((3, at.raw.shape[-1]))
+    for field in range(at.raw.shape[-1]):
+        parts = [r[counts] for r, counts in zip(at.raw[..., field], at.compared, strict=True)]
+        parts = [r for r in parts if r.size > _ORDER]
+        if parts:
+            white = float(np.mean(np.concatenate([np.diff(r, _ORDER) for r in parts]) ** 2)) / _GAIN
+            squares = np.concatenate(parts) ** 2
+            rows[:, field] = squares.sum(), min(white, float(squares.mean())) * squares.size, squares.size
+    return rows[0], rows[1], rows[2]
 
 
 def _quantum(readings: Sequence[float] | np.ndarray) -> float:

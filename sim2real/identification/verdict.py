@@ -99,7 +99,7 @@ def judge(
     *,
     max_delay_s: float = 1.0,
     widened: Collection[str] = (),
-    beyond: Sequence[str] = (),
+    doubts: Sequence[str] = (),
     left: float | None = None,
     exceeded: Sequence[str] = (),
     lacks: Lack = Lack(),
@@ -111,19 +111,19 @@ def judge(
         x: Shape ``(P,)``: the estimate, on the parameters' scales.
         max_delay_s: Longest delay of the model [s].
         widened: Parameters whose bounds the user has set: wider ones would not help again.
-        beyond: Sentences about held-out data outside the range of the fitted data.
+        doubts: Further sentences, which decide nothing.
         left: Length of the next step of a fit that did not converge [standard errors]; None if it converged.
         exceeded: Sentences about errors on held-out data above the expected ones.
         lacks: What the model lacks.
     """
     improves, errors = _on_held_out(held_out)
     if left is not None:
-        return Judgement(NOT_FINISHED, (_not_converged(left), *errors, *beyond, *exceeded, *lacks.reasons))
+        return Judgement(NOT_FINISHED, (_not_converged(left), *errors, *doubts, *exceeded, *lacks.reasons))
     # Collect the reasons: estimates at bounds, absent parameters, undetermined groups.
     determined = [i for i, n in enumerate(table.names) if not any(n in group for group in check.undetermined)]
     bounded, at_zero, flags = _at_bounds(table, x, spread, determined, max_delay_s, widened)
     undetermined = list(check.messages)
-    reasons = [*errors, *beyond, *bounded, *_absent(table, spread)]
+    reasons = [*errors, *doubts, *bounded, *_absent(table, spread)]
     reasons += [f"{name} is estimated at its lowest possible value, 0; the fit is the same with 0" for name in at_zero]
     reasons += undetermined
     if spread.misfit > 3.0:

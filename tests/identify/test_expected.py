@@ -46,6 +46,15 @@ def test_it_is_the_worst_part_and_a_quarter():
     assert not ahead.exceeded
 
 
+def test_of_many_parts_one_that_stands_out_does_not_decide():
+    errors = [*np.linspace(0.01, 0.02, 15), 0.05]
+    found = judged([part(str(i), e, e) for i, e in enumerate(errors)])
+    assert found.expected_of(JOINT.column, AHEAD).error == pytest.approx(1.25 * np.quantile([*errors, 0.01], 0.9))
+    assert found.compared[0].expected < 1.25 * 0.03
+    diverged = judged([part(str(i), e, np.inf if i == 3 else e) for i, e in enumerate(errors)])
+    assert diverged.expected_of(JOINT.column, FREE_RUN) is None
+
+
 def test_an_error_on_held_out_data_is_compared_and_expected_from_then_on():
     found = judged([part("a", 0.01, 0.01), part("b", 0.02, 0.01)], error=0.08, wider=2.0)
     ahead = found.compared[0]
@@ -68,19 +77,18 @@ def test_it_is_not_below_the_noise_and_a_joint_at_rest_is_not_compared():
     assert found.expected_of(JOINT.column, AHEAD).error == pytest.approx(2.0 * JOINT.sigma)
 
 
-def ranges(low, high, speed):
-    """Return the ranges of a robot with one joint, whose labels have no index."""
-    return {"'position' of 'sensor'": (low, high), "the speed of 'position' of 'sensor'": (-speed, speed)}
+def motion(low, high, speed):
+    return {JOINT.column: (low, high, speed)}
 
 
 @pytest.mark.parametrize(
     ("later", "factor"),
     [
-        (ranges(-1.0, 1.0, 2.0), 1.0),
-        (ranges(-0.5, 0.5, 6.0), 3.0),
-        (ranges(-1.0, 2.0, 2.0), 1.5),
-        (ranges(-1.0, 1.0, 90.0), 4.0),
+        (motion(-1.0, 1.0, 2.0), 1.0),
+        (motion(-0.5, 0.5, 6.0), 3.0),
+        (motion(-1.0, 2.0, 2.0), 1.5),
+        (motion(-1.0, 1.0, 90.0), 4.0),
     ],
 )
 def test_the_motion_of_a_single_joint_widens_it(later, factor):
-    assert wider_for(ranges(-1.0, 1.0, 2.0), later, [JOINT]) == {"position[0]": pytest.approx(factor)}
+    assert wider_for(motion(-1.0, 1.0, 2.0), later, [JOINT]) == {"position[0]": pytest.approx(factor)}

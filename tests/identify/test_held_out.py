@@ -1,6 +1,5 @@
 """Parts that are held out: the same as never having recorded them."""
 
-import json
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -13,7 +12,7 @@ from lag import BIAS, CONFIG, LENGTH_S, NOISE, Model, lag_log, spans
 from sim2real.errors import UsageError
 from sim2real.identification import held_out
 from sim2real.identification.fit import fit, refine, refit
-from sim2real.identification.held_out import REFITS, Fold, Refits, folds_of, leave_out, moving
+from sim2real.identification.held_out import Fold, folds_of, leave_out, moving
 from sim2real.identification.model import Channel
 from sim2real.identification.segments import Span
 
@@ -38,24 +37,6 @@ def test_a_part_that_is_left_out_might_as_well_not_have_been_recorded(one):
             assert float(row.values[name]) == pytest.approx(alone[name], abs=0.02 * spread + 2e-5)
 
 
-def test_a_judgement_that_was_ended_continues_with_its_finished_refits(one, tmp_path, monkeypatch):
-    """The second part is not finished: a judgement computes it alone, and all errors are those of one run."""
-    first = Refits(tmp_path / REFITS, "same")
-    leave_out(one.fit, one.parts, 0.2, refits=first)
-    document = json.loads((tmp_path / REFITS).read_text())
-    ends = document["sets"][",".join(one.fit.problem.table.terms)]["ends"]
-    del ends[list(ends)[1]]
-    (tmp_path / REFITS).write_text(json.dumps(document))
-    computed = []
-    monkeypatch.setattr(held_out, "refine", lambda *a, **k: computed.append(1) or refine(*a, **k))
-    again = Refits(tmp_path / "again.json", "same", [tmp_path / REFITS])
-    rows = leave_out(one.fit, one.parts, 0.2, refits=again)
-    assert (len(computed), again.reused) == (1, len(one.parts) - 1)
-    for row, whole in zip(rows, one.rows, strict=True):
-        assert row.ahead == pytest.approx(whole.ahead, rel=1e-6)
-    assert len(json.loads((tmp_path / "again.json").read_text())["sets"].popitem()[1]["ends"]) == len(one.parts)
-
-
 def test_fewer_parameters_are_estimated_as_by_a_table_that_holds_the_others(one):
     problem, names = one.fit.problem, one.fit.problem.table.names
     present = np.array([n in ("gain", "tau") for n in names])
@@ -73,7 +54,7 @@ def test_fewer_parameters_are_estimated_as_by_a_table_that_holds_the_others(one)
     # A model to compare with by percents ends earlier.
     coarse = refit(problem, present, one.fit.x)
     assert (coarse["bias"], coarse["square"]) == (0.0, 0.0)
-    assert problem.loss(problem.table.encode(coarse), data) == pytest.approx(alone.loss, rel=2e-3)
+    assert problem.loss(problem.table.encode(coarse), data) == pytest.approx(alone.loss, rel=2e-2)
     assert refit(problem, np.zeros(len(names), bool), one.fit.x)["gain"] == 1.5
 
 
@@ -121,8 +102,7 @@ def test_recordings_are_left_out_whole_and_one_that_differs_stands_out(three):
 def test_of_many_parts_several_share_a_refit_without_all_of_them(three, monkeypatch):
     whole, _ = three
     monkeypatch.setattr(held_out, "MOST", 2)
-    parts, refits = folds_of(whole.problem, 3), Refits()
-    rows = leave_out(whole, parts, 0.2, 0.0, refits)
+    rows = leave_out(whole, folds_of(whole.problem, 3), 0.2)
     assert [r.name for r in rows] == ["recording 1", "recording 2", "recording 3"]
     assert rows[0].values == rows[2].values != rows[1].values
     # The last two rows are of fits without and with the log of the other robot.

@@ -13,6 +13,7 @@ from sim2real.identification.fit import fit
 from sim2real.identification.parameters import Parameter, ParameterTable
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.identify.fitting import Fits, determined
+from sim2real.stages.identify.inputs import Inputs
 from sim2real.stages.identify.judgement import Findings
 from sim2real.stages.shared.identification import long_spans
 
@@ -43,12 +44,13 @@ def test_one_factor_of_a_product_is_held_and_the_other_is_for_that_value(long_s,
     wide = fit(model, [episode], SPANS, LENGTH_S, config, long_spans=longer)
     found = Findings.of(wide, ())
     assert found.check.undetermined
-    inputs = SimpleNamespace(model=model, episodes=[episode], fitted=1, windows=SPANS, config=config)
+    logs = (SimpleNamespace(episode=episode),)
+    inputs = Inputs(None, config, None, model, model.parameters, logs, ("",), 1, SPANS)
     lengths, descend = [], fitting._refine
     monkeypatch.setattr(
         fitting, "_refine", lambda problem, *rest: lengths.append(problem.segment_s) or descend(problem, *rest)
     )
-    fits, sentences = determined(inputs, Fits(wide, wide, None), found.check, found.spread)
+    fits, sentences = determined(Fits(inputs, wide), found.check, found.spread)
     values, (sentence,) = fits.estimate.values, sentences
     held, other = ("first", "second") if "first is held" in sentence else ("second", "first")
     assert f"{held} is held at its nominal value" in sentence

@@ -53,7 +53,7 @@ def test_residuals_are_above_the_noise_by_the_errors_of_the_model(slow, ratio):
     raw = rng.standard_normal((SEGMENTS, LENGTH, 2)) + slow * np.sqrt(2.0) * np.sin(2 * t)[..., None]
     compared = np.ones(raw.shape[:2], bool)
     raw[::2, -20:], compared[::2, -20:] = 7.0, False
-    assert above_noise(linearised(raw, compared)) == pytest.approx(ratio, rel=0.03)
+    assert above_noise(linearised(raw, compared)) == pytest.approx(ratio, rel=0.05)
 
 
 def linearised(raw, compared):

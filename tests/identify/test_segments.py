@@ -1,4 +1,4 @@
-"""Segments: what held-out data does that fitted data did not."""
+"""Segments: how far and how fast joints move in them."""
 
 from types import SimpleNamespace
 
@@ -7,57 +7,21 @@ import pytest
 
 from sim2real.graph.episode import Episode, Steps
 from sim2real.identification.model import Channel
-from sim2real.identification.segments import Span, beyond, ranges
-
-MODEL = SimpleNamespace(
-    sensor="sensor", given={"actuator": {"goal": "goal", "kp": "kp"}}, channels=(Channel("position", None, 0.01, 0.1),)
-)
+from sim2real.identification.segments import Span, extents
 
 
-def recording(kp, reach):
-    at = np.arange(100) * 10_000
-    steps = Steps(at, at, at, np.full(100, -1), at, 0 * at)
-    goal = reach * np.sin(at / 1e5)
-    outputs = {
-        "actuator": {"goal": np.stack([goal, 0 * goal], axis=1), "kp": np.full(100, kp)},
-        "sensor": {"position": 0.9 * goal},
-    }
-    return Episode(steps={"sensor": steps, "actuator": steps}, messages={}, outputs=outputs)
+def recording(reach, rad_s=10.0):
+    at = np.arange(200) * 10_000
+    steps = Steps(at, at, at, np.full(200, -1), at, 0 * at)
+    position = np.stack([reach * np.sin(rad_s * at / 1e6), 0.3 + 0.0 * at], axis=1)
+    return Episode(steps={"sensor": steps}, messages={}, outputs={"sensor": {"position": position}})
 
 
-SPANS = [Span(0, 0.0), Span(1, 0.0), Span(2, 0.0, False)]
-
-
-def both(logs):
-    """The ranges of fitted and of held-out segments."""
-    return [ranges(MODEL, logs, [s for s in SPANS if s.fitted == fitted], 0.9) for fitted in (True, False)]
-
-
-def test_a_gain_in_between_is_no_extrapolation():
-    logs = [recording(100.0, 1.0), recording(800.0, 1.0), recording(200.0, 1.0)]
-    assert beyond(*both(logs)) == []
-
-
-@pytest.mark.parametrize(
-    ("kp", "reach", "words"),
-    [(800.0, 1.0, ["'kp' of 'actuator' reaches [800, 800], fitted was [100, 200]"]),
-     (150.0, 1.5, ["'goal[0]' of 'actuator' reaches [-1.5, 1.5]", "'position' of 'sensor' reaches",
-                      "the speed of 'position' of 'sensor' reaches"])],
-)  # fmt: skip
-def test_what_goes_beyond_is_named(kp, reach, words):
-    logs = [recording(100.0, 1.0), recording(200.0, 1.0), recording(kp, reach)]
-    said = beyond(*both(logs))
-    assert len(said) == len(words)
-    assert all(any(w in s for s in said) for w in words)
-
-
-def test_with_nothing_held_out_nothing_is_said():
-    assert beyond(ranges(MODEL, [recording(1.0, 1.0)], [Span(0, 0.0)], 0.5), {}) == []
-
-
-def test_a_faster_motion_within_the_same_range_goes_beyond():
-    slow, fast = recording(1.0, 1.0), recording(1.0, 1.0)
-    at = fast.steps["sensor"].begun_s
-    fast.outputs["sensor"]["position"] = 0.9 * np.sin(2e1 * at)
-    (said,) = beyond(ranges(MODEL, [slow], [Span(0, 0.0)], 0.9), ranges(MODEL, [fast], [Span(0, 0.0)], 0.9))
-    assert said.startswith("the speed of 'position' of 'sensor' reaches [-1")
+def test_extents_are_of_the_segments_alone_and_of_each_joint():
+    channels = tuple(Channel("position", None, 0.01, 0.1, i) for i in range(2))
+    model, logs = SimpleNamespace(sensor="sensor", channels=channels), [recording(1.0), recording(0.5, 40.0)]
+    found = extents(model, logs, [Span(0, 0.0), Span(1, 0.5)], 0.9)
+    assert found["position[0]"] == pytest.approx((-1.0, 1.0, 16.8), rel=0.05)  # 20 rad/s, averaged over 50 ms
+    assert found["position[1]"] == pytest.approx((0.3, 0.3, 0.0))
+    assert extents(model, logs, [Span(0, 0.0)], 0.1)["position[0]"] == pytest.approx((0.0, 0.84, 9.6), rel=0.05)
+    assert extents(model, logs, [Span(0, 9.0)], 0.9) == {}

@@ -7,7 +7,7 @@ import pytest
 from lag import BIAS, CONFIG, LENGTH_S, Model, lag_log, spans
 
 from sim2real.identification.fit import fit
-from sim2real.identification.held_out import Refits, folds_of
+from sim2real.identification.held_out import folds_of
 from sim2real.identification.terms import Selection, TermSearch, Trial, gains
 
 
@@ -15,11 +15,10 @@ from sim2real.identification.terms import Selection, TermSearch, Trial, gains
 def search():
     """The search of three logs' terms: their input has a bias and no square."""
     episodes = [lag_log(seed) for seed in (1, 2, 3)]
-    whole = fit(Model(), episodes, [s for r in range(3) for s in spans(r)], LENGTH_S, CONFIG, as_start=True)
-    refits = Refits()
+    whole = fit(Model(), episodes, [s for r in range(3) for s in spans(r)], LENGTH_S, CONFIG)
     return SimpleNamespace(
-        fit=whole, table=whole.problem.table, refits=refits,
-        search=TermSearch(whole, folds_of(whole.problem, 3), 0.2, 2.0, refits),
+        fit=whole, table=whole.problem.table,
+        search=TermSearch(whole, folds_of(whole.problem, 3), 0.2, 2.0),
     )  # fmt: skip
 
 
@@ -35,7 +34,6 @@ def test_the_term_that_the_logs_have_is_chosen_and_no_other(search):
     assert all(float(r.values["square"]) == 0.0 for r in chosen.rows)
     assert chosen.error == pytest.approx(1.0, abs=0.15)
     assert chosen.above < 1.2
-    assert len(search.refits._document.sets["bias"].ends) == 3
     rows = {r.term: r for r in gains(selection, table)}
     assert (rows["bias"].outcome, rows["square"].outcome) == (
         "chosen",
@@ -47,11 +45,14 @@ def test_the_term_that_the_logs_have_is_chosen_and_no_other(search):
 def test_what_a_model_lacks_is_found_by_the_same_round(search):
     none = np.zeros(2, bool)
     selection = search.search.further(search.fit.x, none)
-    rows = {r.term: r for r in gains(selection, search.table)}
+    assert selection.chosen.names(search.table) == ("bias",)
+    assert selection.chosen.error < 0.5 * selection.trials[0].error
+    rows = {r.term: r for r in gains(Selection(selection.trials[0], selection.trials), search.table)}
     assert rows["bias"].outcome == "mends"
     assert rows["bias"].gain > 0.5
     assert rows["square"].outcome != "mends" or rows["square"].gain < rows["bias"].gain
     with_bias = search.search.further(search.search.select().chosen.x, np.array([True, False]))
+    assert with_bias.chosen is with_bias.trials[0]
     assert all(r.outcome != "mends" for r in gains(with_bias, search.table))
 
 

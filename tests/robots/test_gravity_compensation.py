@@ -10,7 +10,7 @@ from recorded_on_c import play
 from sim2real.identification import held_out, terms
 from sim2real.identification import problem as problems
 from sim2real.identification.fit import fit
-from sim2real.identification.held_out import Refits, folds_of
+from sim2real.identification.held_out import folds_of
 from sim2real.identification.segments import Span
 from sim2real.identification.terms import TermSearch
 from sim2real.robots.model.parameters import ParameterPattern
@@ -56,7 +56,7 @@ def test_auto_finds_that_the_controller_carries_the_weight(recorded, monkeypatch
     of_segment = 0.6 / STEP_S * (problems._BESIDE + 1) * len(widest.problem.table)
     monkeypatch.setattr(terms, "MOST_OF_SETS", kept * of_segment + 1)
     parts, sets = folds_of(widest.problem, 3), []
-    search = TermSearch(widest, parts, config.settle_s, config.free_run_s, Refits(), sets.append)
+    search = TermSearch(widest, parts, config.settle_s, config.free_run_s, sets.append)
     simulated, ahead = [], held_out._ahead
     monkeypatch.setattr(
         held_out, "_ahead", lambda windows, *rest: (simulated.append(windows), ahead(windows, *rest))[1]

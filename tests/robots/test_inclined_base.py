@@ -11,6 +11,7 @@ from sim2real.identification.segments import Span
 from sim2real.robots.model.parameters import ParameterPattern
 from sim2real.robots.model.robot import MjcfRobot, RobotConfig
 from sim2real.stages.config import IdentifyConfig
+from sim2real.stages.identify.inputs import Inputs
 from sim2real.stages.identify.judgement import inclined
 
 STEP_S, PERIOD, SECONDS, KP = 0.002, 5, 4.0, 60.0
@@ -28,16 +29,13 @@ def found(tmp_path, angle, fix=None):
     goals = (0.8 * np.sin(2.1 * t) + 0.4 * np.sin(5.3 * t))[:, None]
     episode = play(model, goals, lambda k, _, data: KP * (goals[k] - data.qpos), PERIOD, 2e-4)
     patterns = (ParameterPattern("kp"), ParameterPattern("damping"))
-    config = RobotConfig(tmp_path / "arm.xml", ("shoulder",), ("goal",), step_s=STEP_S, rate_hz=100.0, terms=patterns)
-    robot = MjcfRobot(config)
+    rig = RobotConfig(tmp_path / "arm.xml", ("shoulder",), ("goal",), step_s=STEP_S, rate_hz=100.0, terms=patterns)
+    robot = MjcfRobot(rig)
     values = {p.name: KP if p.name.startswith("kp") else p.nominal for p in robot.identifiable(0.02).parameters}
-    inputs = SimpleNamespace(
-        loaded=robot,
-        config=IdentifyConfig(max_delay_s=0.02, settle_s=0.1, horizon_s=0.5, fix=fix or {}),
-        episodes=[episode],
-        fitted=1,
-        windows=[Span(0, begin) for begin in np.arange(0.2, SECONDS - 0.8, 0.6)],
-    )
+    config = IdentifyConfig(max_delay_s=0.02, settle_s=0.1, horizon_s=0.5, fix=fix or {})
+    windows = [Span(0, begin) for begin in np.arange(0.2, SECONDS - 0.8, 0.6)]
+    logs = (SimpleNamespace(episode=episode),)
+    inputs = Inputs(robot, config, robot, None, None, logs, ("",), 1, windows)
     return inclined(inputs, SimpleNamespace(problem=SimpleNamespace(table=SimpleNamespace(terms=())), values=values))
 
 

@@ -6,8 +6,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sim2real.artifacts.identification import Estimate, FreeRun, Identification, Judgement, Noise, TriedTerm
-from sim2real.identification.held_out import Refits
+from sim2real.artifacts.identification import (
+    Estimate,
+    FreeRun,
+    Identification,
+    Judgement,
+    Noise,
+    TriedTerm,
+    WorstSecond,
+)
 from sim2real.identification.verdict import Position
 from sim2real.stages.identify import judgement
 from sim2real.stages.identify.judgement import farthest_run, lack, largest_residual
@@ -30,50 +37,28 @@ def document(times_noise, *runs, tried=(), terms=()):
     )
 
 
-def lacked(found, monkeypatch, tried=None, again=None, terms="own", leaning=None):
-    """Return what a document lacks; ``tried`` and ``again``: what fits with further terms give; None: no fit."""
-
-    def fitted(*_):
-        assert tried is not None
-        return tried
-
-    def ran(inputs, wanted, term):
-        assert again is not None
-        return again and [run("x[0]", again), run("x[0]", 0.2, model="hold")]
-
-    monkeypatch.setattr(judgement, "_tried", fitted)
-    monkeypatch.setattr(judgement, "_free_runs_with", ran)
+def lacked(found, monkeypatch, leaning=None):
+    """Return what a document lacks."""
     monkeypatch.setattr(judgement, "positions", lambda *_: [AXIS, ARM])
     monkeypatch.setattr(judgement, "noises", lambda *_: NOISE)
     monkeypatch.setattr(judgement, "inclined", lambda *_: leaning)
-    refits = Refits()
-    refits.begin(("drag",), np.zeros(1), 1.0)
-    inputs = SimpleNamespace(
-        config=SimpleNamespace(terms=terms, folds=5),
-        model=None,
-        units={},
-        robot=SimpleNamespace(units={}),
-        refits=refits,
-    )
-    table = SimpleNamespace(terms=("drag",))
-    fit = SimpleNamespace(converged=True, problem=SimpleNamespace(train=np.arange(9), table=table))
-    return lack(found, inputs, fit)[1]
+    inputs = SimpleNamespace(model=None, units={}, robot=SimpleNamespace(units={}))
+    return lack(found, SimpleNamespace(inputs=inputs, estimate=SimpleNamespace(converged=True)))
 
 
 @pytest.mark.parametrize(
-    ("times_noise", "tried", "terms", "named", "flags"),
+    ("times_noise", "tried", "named", "flags"),
     [
-        (3.0, None, "own", (), ""),
-        (3.1, (), "own", ("no optional term was tried",), ""),
-        (25.0, (TriedTerm("load", 8.0, 0.4, "mends"),), "own", ("25 times", "load", "95%"), "--terms drag,load"),
-        (75.0, (TriedTerm("load", 8.0, 5.0, "mends"),), "own", ("load", "--terms drag,load", "gravity"), ""),
-        (75.0, (TriedTerm("load", 8.0, 7.9, "no gain"),), "own", ("none of the terms", "gravity"), ""),
-        (75.0, None, "auto", ("no further term", "gravity"), ""),
+        (3.0, (), (), ""),
+        (3.1, (), ("no optional term was tried",), ""),
+        (25.0, (TriedTerm("load", 8.0, 0.4, "mends"),), ("25 times", "load", "95%"), "--terms drag,load"),
+        (75.0, (TriedTerm("load", 8.0, 5.0, "mends"),), ("load", "--terms drag,load", "gravity"), ""),
+        (75.0, (TriedTerm("load", 8.0, 7.9, "no gain"),), ("no further term", "gravity"), ""),
+        (75.0, (TriedTerm("drag", 8.0, 0.4, "chosen"),), ("no further term", "gravity"), ""),
     ],
 )
-def test_a_model_lacks_the_term_that_halves_its_errors(times_noise, tried, terms, named, flags, monkeypatch):
-    before = (TriedTerm("load", 8.0, 0.4, "mends"),) if terms == "auto" else ()
-    found = lacked(document(times_noise, tried=before, terms=("drag",)), monkeypatch, tried, terms=terms)
+def test_a_model_lacks_the_term_that_halves_its_errors(times_noise, tried, named, flags, monkeypatch):
+    found = lacked(document(times_noise, tried=tried, terms=("drag",)), monkeypatch)
     assert found.flags == flags
     assert found.unexplained == (times_noise > 50.0)
     assert len(found.reasons) == bool(named)
@@ -83,30 +68,26 @@ def test_a_model_lacks_the_term_that_halves_its_errors(times_noise, tried, terms
 @pytest.mark.parametrize(("times_noise", "named"), [(9.0, False), (25.0, True)])
 def test_gravity_of_another_direction_is_named_first_with_its_command(times_noise, named, monkeypatch):
     leaning = 0.99, {"tilt_x": 0.0, "tilt_y": 0.7}, "--terms tilt"
-    found = lacked(document(times_noise, terms=("drag",)), monkeypatch, (), leaning=leaning)
+    found = lacked(document(times_noise, terms=("drag",)), monkeypatch, leaning)
     assert ("+0.70 rad (tilt_y)" in found.reasons[0]) == named
     assert found.flags == ("--terms tilt" if named else "")
 
 
 @pytest.mark.parametrize(
-    ("runs", "again", "named", "flags"),
+    ("runs", "named"),
     [
-        ([], None, [], ""),
-        ([run("x[0]", 0.002), run("x[1]", 0.01)], None, ["axis is off by 2 mm, 1.0%"], ""),
-        ([run("x[0]", 0.002), run("x[1]", 0.19)], None, ["arm is off by 190 mrad, 9.5%"], ""),
-        ([run("x[0]", 0.05)], (), ["axis is off by 50 mm, 25.0%", "does not mend"], ""),  # offers no term
-        ([run("x[0]", 0.05)], 0.004, ["25.0%", "off by 4 mm"], "--terms load,direction"),
-        ([run("x[0]", 0.04), run("x[0]", 0.06, 1)], 0.004, ["off by 50 mm", "4 mm"], "--terms load,direction"),
-        ([run("x[0]", 0.05)], 0.04, ["25.0%", "direction does not mend"], ""),
-        ([run("x[0]", None)], 0.004, ["axis diverges", "4 mm"], "--terms load,direction"),
-        ([run("x[0]", 0.05)], float("nan"), ["25.0%", "direction does not mend"], ""),
-        ([run("x[0]", 0.002), run("x[0]", 0.09, model="nominal")], None, ["2 mm"], ""),
-        ([run("x[0]", 0.002), run("x[0]", 0.09, held_out=False)], None, ["2 mm"], ""),
+        ([], []),
+        ([run("x[0]", 0.002), run("x[1]", 0.01)], ["axis is off by 2 mm, 1.0%"]),
+        ([run("x[0]", 0.002), run("x[1]", 0.19)], ["arm is off by 190 mrad, 9.5%"]),
+        ([run("x[0]", 0.04), run("x[0]", 0.06, 1)], ["axis is off by 50 mm, 25.0%"]),
+        ([run("x[0]", None)], ["axis diverges"]),
+        ([run("x[0]", 0.002), run("x[0]", 0.09, model="nominal")], ["2 mm"]),
+        ([run("x[0]", 0.002), run("x[0]", 0.09, held_out=False)], ["2 mm"]),
     ],
-)  # fmt: skip
-def test_the_worst_free_run_is_named_and_mended_where_a_term_does(runs, again, named, flags, monkeypatch):
-    found = lacked(document(1.0, *runs, terms=("load",)), monkeypatch, None, again)
-    assert found.flags == flags
+)
+def test_the_worst_free_run_is_named(runs, named, monkeypatch):
+    found = lacked(document(1.0, *runs, terms=("load",)), monkeypatch)
+    assert not found.flags
     assert len(found.reasons) == len(named)
     assert all(word in reason for word, reason in zip(named, found.reasons, strict=True))
 
@@ -120,6 +101,15 @@ def test_positions_are_compared_by_their_own_noise_and_range():
     assert largest_residual(found, (Noise("x[1]", "rad", 0.0, 0.0, 0.0),), [ARM])[2] == pytest.approx(1e-4)
     assert largest_residual(found, (), [ARM]) is None
     assert farthest_run(found, [AXIS, ARM]) == (AXIS, 0.05, pytest.approx(0.25))
+
+
+@pytest.mark.parametrize(("error", "of_motion", "said", "alone"), [
+    (0.3, 0.9, True, True), (0.02, 0.6, True, False), (0.3, 0.4, False, False), (None, None, True, True),
+])  # fmt: skip
+def test_a_second_that_is_worse_than_all_others_is_named_before_what_it_bends(error, of_motion, said, alone):
+    worst = WorstSecond("arm", "x[1]", "rad", 0, 0, 4.1, 5.1, error, None, of_motion)
+    sentence, first = judgement._fault(worst, document(20.0))
+    assert ("arm in the second from 4.1 s" in sentence, first) == (said, alone)
 
 
 def test_no_parameter_is_ok_in_a_fit_that_is_not_accepted():

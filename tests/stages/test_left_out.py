@@ -13,9 +13,8 @@ from sim2real.identification.predictions import Position
 from sim2real.identification.residuals import Linearised
 from sim2real.identification.uncertainty import Uncertainty
 from sim2real.stages.config import IdentifyConfig
-from sim2real.stages.identify import fitting
 from sim2real.stages.identify.fitting import widened
-from sim2real.stages.identify.progress import Best
+from sim2real.stages.identify.inputs import table_of
 from sim2real.stages.shared.identification import with_wanted_terms
 
 ANGLE = Position("th", "tilt", "rad", 0.001)
@@ -119,7 +118,7 @@ def test_folds_that_leave_nothing_to_compare_are_refused(options):
         IdentifyConfig(**options)
 
 
-def test_the_second_fit_holds_what_was_left_out_and_what_a_flag_holds(monkeypatch):
+def test_terms_that_are_not_named_are_off_and_a_flag_holds_a_value_in_whichever_term():
     table = ParameterTable(
         [
             Parameter("gain", "1", 1.0, 0.5, 2.0),
@@ -127,28 +126,10 @@ def test_the_second_fit_holds_what_was_left_out_and_what_a_flag_holds(monkeypatc
             Parameter("swing", "1", 0.1, -1.0, 1.0, "linear", term="swing", off=0.0),
             Parameter("bias", "1", 0.2, -1.0, 1.0, "linear", term="bias"),
         ]
-    ).with_fixed({"swing": 0.3})
-    values = {"gain": 1.5, "cogging": 0.4, "swing": 0.3, "bias": 0.6}
-    tables = []
-
-    def fit(model, episodes, fitted, windows, config, table, tell, begins=None, as_start=False):
-        tables.append((config.generations, table))
-        return SimpleNamespace(values=values, problem=SimpleNamespace(table=table))
-
-    monkeypatch.setattr(fitting, "fitted_to", fit)
-    chosen = ParameterTable(p for p in table if p.free)
-    z = chosen.encode({"gain": 1.4, "cogging": 0.4, "bias": 0.6})
-    selection = SimpleNamespace(chosen=SimpleNamespace(names=lambda _: ("cogging",), x=z))
-    monkeypatch.setattr(fitting, "chosen", lambda *_: selection)
-    config = IdentifyConfig(terms="auto", fix={"swing": 0.3})
-    inputs = SimpleNamespace(
-        config=config, table=table, model=None, episodes=[], fitted=1, windows=[], names=["log"], refits=None
     )
-    fitting.fit_model(inputs, Best())
-    fewer = tables[1][1]
+    model = SimpleNamespace(parameters=table, reached=lambda _: {})
+    fewer = table_of(model, IdentifyConfig(terms="cogging", fix={"swing": 0.3}), [])
     assert fewer.terms == ("cogging",)
-    assert [(generations, own) for generations, own in tables] == [(config.generations, table), (0, fewer)]
     assert {p.name: (p.nominal, p.free) for p in fewer} == {
         "gain": (1.0, True), "cogging": (0.1, True), "swing": (0.3, False), "bias": (0.2, False),
     }  # fmt: skip
-    assert {p.name: p.begin for p in fewer if p.free} == pytest.approx({"gain": 1.4, "cogging": 0.4})

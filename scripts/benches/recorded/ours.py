@@ -177,12 +177,13 @@ def _fit_with_terms(case: Case, fitted: dict[str, Any]) -> Any:
     model, length = case.model, c.settle_s + c.horizon_s
     table = shared.with_wanted_terms(model.parameters, c.terms)
     spans = windows(episodes, length, c.spacing_s, c.initial_state == "free")
-    every = fit_model(model, episodes, spans, length, c, table, as_start=True)
-    selection = fitting.chosen(every, c, list(fitted))
-    fewer, values = table.with_terms(selection.chosen.names(table)), as_numbers(every.problem.table, selection.chosen.x)
-    fewer = fewer.with_begin({p.name: float(np.squeeze(values[p.name])) for p in fewer if p.free})
+    none = fit_model(model, episodes, spans, length, c, table.with_terms(()))
+    problem = Problem(model, episodes, spans, length, c, table)
+    selection = fitting.compare_terms(none, problem, c, list(fitted))
+    fewer = table.with_terms(selection.chosen.names(table))
+    end = fewer.encode(as_numbers(problem.table, selection.chosen.x))
     longer = shared.covering([(0.0, e.duration_s) for e in episodes], c.long_s or 0.0)
-    return fit_model(model, episodes, spans, length, c, fewer, longer)
+    return fit_model(model, episodes, spans, length, c, fewer, longer, end=end)
 
 
 def _model(fitted: Sequence[Recording], folder: Path) -> Path:

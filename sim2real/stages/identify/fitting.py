@@ -1,4 +1,4 @@
-"""The fits of an identification: with all optional terms, with the selected ones, and without parts of the logs."""
+"""The fits of an identification: with selected optional terms, and without parts of the logs."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -6,20 +6,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sim2real.artifacts.identification import Determined, HeldOutPart
-from sim2real.graph.episode import Episode
+from sim2real.artifacts.identification import Determined, HeldOutPart, TriedTerm
 from sim2real.identification.fit import Fit, OnProgress, as_numbers, fit
-from sim2real.identification.held_out import MOST, Fold, Refits, folds_of, leave_out
-from sim2real.identification.model import IdentifiableModel
+from sim2real.identification.held_out import MOST, Fold, folds_of, leave_out
 from sim2real.identification.parameters import ParameterTable
 from sim2real.identification.problem import Problem
 from sim2real.identification.residuals import Linearised
-from sim2real.identification.segments import Span
-from sim2real.identification.terms import Selection, TermSearch
-from sim2real.identification.uncertainty import ABSENT, NOT_REACHED, Uncertainty, between_parts
+from sim2real.identification.terms import Selection, TermSearch, gains
+from sim2real.identification.uncertainty import ABSENT, NOT_REACHED, Uncertainty, above_noise, between_parts
 from sim2real.identification.uncertainty import determined as what_is_determined
 from sim2real.stages.identify.config import IdentifyConfig
-from sim2real.stages.identify.inputs import Inputs
+from sim2real.stages.identify.inputs import Inputs, with_terms
 from sim2real.stages.identify.progress import Best
 from sim2real.stages.shared.identification import long_spans
 from sim2real.stages.terminal.console import note, progress
@@ -27,44 +24,80 @@ from sim2real.stages.terminal.interruption import patiently
 
 _PERCENT_OF_SEARCH, _PERCENT_OF_REFINEMENT = 70, 30
 """Shares of a progress bar."""
-_AS_GOOD = 3e-4
+_AS_GOOD = 1e-3
 """Relative excess of the loss up to which a fit with a held parameter is as good."""
-LEAST_SEGMENTS = 4
+_LEAST_SEGMENTS = 4
 """Fewest segments from which parts are held out."""
 _LEAST_TO_CHOOSE = 3
 """Fewest parts for a selection of terms: one is held out, and the others predict each other."""
 _LEAST_PARTS = 4
 """Fewest parts from which the spread of estimates is computed."""
+_FAR = 2.0
+"""Ratio of residuals to noise above which a term may be missing."""
 
 
 @dataclass(frozen=True)
 class Fits:
-    """The fits of an identification.
+    """The fit of an identification.
 
     Attributes:
-        widest: The fit with all optional terms.
-        estimate: The fit with the selected terms.
-        selection: How the terms were selected; None without a selection.
+        inputs: The data, and the model with the terms of the estimate.
+        parts: Errors without each part of the recordings, where the selection of terms has them.
+        tried: What optional terms gain on held-out parts; empty if none was tried.
+        added: The optional term that was added, as it halves the errors; "": none.
     """
 
-    widest: Fit
+    inputs: Inputs
     estimate: Fit
-    selection: Selection | None
+    parts: tuple[HeldOutPart, ...] | None = None
+    tried: tuple[TriedTerm, ...] = ()
+    added: str = ""
 
     @property
     def terms(self) -> tuple[str, ...] | None:
         """Names of the optional terms of the estimate; None if the model has none."""
-        return self.estimate.problem.table.terms if self.widest.problem.table.terms else None
+        names = self.estimate.problem.table.terms
+        return names if names or self.inputs.config.terms == "auto" else None
 
 
 def fit_model(inputs: Inputs, best: Best) -> Fits:
-    """Fit the model, and select its optional terms if the configuration is ``auto``.
+    """Fit the model, and select its optional terms.
+
+    With ``auto`` they are selected among all, beginning with none; otherwise terms are compared beside the model's own
+    where residuals are far above the noise, and one that halves the errors is added if the terms are ``own``.
 
     Args:
         best: Updated with the best values so far.
     """
-    config, table = inputs.config, inputs.table
-    data = (inputs.model, inputs.episodes, inputs.fitted, inputs.windows)
+    config, auto = inputs.config, inputs.config.terms == "auto"
+    base = with_terms(inputs, "none") if auto else inputs
+    # Terms are compared on windows, which takes less time; long segments follow.
+    longer = bool(long_spans(inputs.episodes, inputs.fitted, config)) and config.refine_steps > 0
+    windows = replace(base, config=replace(config, long_s=0.0)) if longer else base
+    whole = _fitted(windows, best, "identify")
+    own, values, tried, added = whole.problem.table.terms, whole.values, (), ""
+    parts: tuple[HeldOutPart, ...] | None = None
+    with progress(None, "identify: sets of terms") as bar:
+        found = patiently(lambda: _compared(inputs, whole, bar.set_postfix_str))
+    if found is not None:
+        table, selection = found
+        terms = selection.chosen.names(table) if config.terms in ("auto", "own") else own
+        added = ", ".join(n for n in terms if n not in own) if not auto else ""
+        beside = selection if auto or added else replace(selection, chosen=selection.trials[0])
+        tried = tuple(row for row in gains(beside, table) if row.term not in own)
+        if auto or added:
+            base, values = with_terms(inputs, ",".join(terms) or "none"), as_numbers(table, selection.chosen.x)
+        parts = tuple(selection.chosen.rows) if auto else None
+    if base is inputs and not longer:
+        return Fits(inputs, whole, tried=tried)
+    # Refine the model with the selected terms; the parameters of all other terms have their values without the term.
+    title = f"identify with {', '.join(base.table.terms) or 'no term'}" if tried else "identify"
+    estimate = _fitted(base, best, title, end=base.table.encode(values))
+    return Fits(base, replace(estimate, search=whole.search), parts, tried, added)
+
+
+def _fitted(inputs: Inputs, best: Best, title: str, end: np.ndarray | None = None) -> Fit:
+    """Return a fit that shows its progress."""
 
     def on_begin(problem: Problem) -> None:
         note(f"engine: {problem.engine}")
@@ -72,47 +105,84 @@ def fit_model(inputs: Inputs, best: Best) -> Fits:
             note(f"the fit takes {few} of {every} segments, those with most motion of each log; all are predicted")
         best.begin(problem)
 
-    # Fit the model with all terms that the configuration allows; terms are selected on windows, which takes less time.
-    auto = config.terms == "auto"
-    wide = replace(config, long_s=0.0) if auto else config
-    best.restart(table)
-    with _progress("identify", best) as report:
-        widest = patiently(lambda: fitted_to(*data, wide, table, report, on_begin, as_start=auto))
-    if not auto:
-        return Fits(widest, widest, None)
-    # Select the terms without which held-out parts are predicted worse.
-    with progress(None, "identify: sets of terms") as bar:
-        on_set = bar.set_postfix_str
-        selection = patiently(lambda: chosen(widest, config, inputs.names, inputs.refits, on_set))
-    terms: Sequence[str] = selection.chosen.names(widest.problem.table)
-    # Refine the model with the selected terms. A value fixed by a flag stays fixed, in whichever term the parameter is;
-    # the parameters of all other terms have their values without the term.
-    narrow = table.with_terms(terms).with_fixed(config.fix)
-    values = as_numbers(widest.problem.table, selection.chosen.x)
-    narrow = narrow.with_begin({p.name: values[p.name] for p in narrow if p.free})
-    best.restart(narrow)
-    with _progress(f"identify with {', '.join(terms) or 'no term'}", best) as report:
-        estimate = patiently(lambda: fitted_to(*data, replace(config, generations=0), narrow, report, best.begin))
-    return Fits(widest, estimate, selection)
+    best.restart(inputs.table)
+    with _progress(title, best) as report:
+        return patiently(lambda: fit_to(inputs, report, on_begin, end))
 
 
-def determined(inputs: Inputs, fits: Fits, check: Determined, spread: Uncertainty) -> tuple[Fits, list[str]]:
+def fit_to(
+    inputs: Inputs,
+    report: OnProgress | None = None,
+    on_begin: Callable[[Problem], None] | None = None,
+    end: np.ndarray | None = None,
+) -> Fit:
+    """Return the fit of a model to its logs; arguments as of ``fit``."""
+    config = inputs.config
+    longer, length_s = long_spans(inputs.episodes, inputs.fitted, config), config.settle_s + config.horizon_s
+    data = (inputs.model, inputs.episodes, inputs.windows, length_s, config, inputs.table, longer)
+    return fit(*data, report=report, on_begin=on_begin, end=end)
+
+
+def _compared(inputs: Inputs, own: Fit, on_set: Callable[[str], None]) -> tuple[ParameterTable, Selection] | None:
+    """Return the table of all terms, and the sets of them that were compared; None if there is no need, or no term."""
+    terms, auto = own.problem.table.terms, inputs.config.terms == "auto"
+    if not auto and (not has_parts(inputs, own) or above_noise(own.problem.linearise(own.x)) < _FAR):
+        return None
+    more = with_terms(inputs, ",".join(["auto", *terms]), "all")
+    if not set(more.table.terms) - set(terms) or not set(own.values) <= {p.name for p in more.table}:
+        return None
+    config, length_s = inputs.config, inputs.config.settle_s + inputs.config.horizon_s
+    problem = Problem(more.model, inputs.episodes, inputs.windows, length_s, config, more.table)
+    return problem.table, compare_terms(own, problem, config, inputs.names, on_set)
+
+
+def compare_terms(
+    own: Fit,
+    problem: Problem,
+    config: IdentifyConfig,
+    names: Sequence[str],
+    on_set: Callable[[str], None] = lambda names: None,
+) -> Selection:
+    """Return the terms without which held-out parts are predicted worse, or further ones beside those of a fit.
+
+    Args:
+        problem: The same segments for the model with all optional terms.
+        names: A name for each recording; recordings of different names are different parts.
+        on_set: Called with the names of each set of terms before it is fitted.
+    """
+    table, auto = problem.table, config.terms == "auto"
+    x = table.encode({p.name: p.without for p in table} | own.values)
+    whole = replace(own, problem=problem, windows=problem, x=x, refined=(), search=None)
+    parts = parts_of(whole, config, names, _LEAST_TO_CHOOSE if auto else 2)
+    search = TermSearch(whole, parts, config.settle_s, config.free_run_s, on_set)
+    if search.segments < (count := len(problem.train)):
+        note(f"sets of terms are compared on {search.segments} of {count} segments, those with most motion")
+    present = np.array([name in own.problem.table.terms for name in table.terms], bool)
+    return search.select() if auto else search.further(x, present)
+
+
+def has_parts(inputs: Inputs, fitted: Fit) -> bool:
+    """Return whether parts of the recordings are held out, on which terms are compared."""
+    return bool(fitted.converged and inputs.config.folds and len(fitted.problem.train) >= _LEAST_SEGMENTS)
+
+
+def determined(fits: Fits, check: Determined, spread: Uncertainty) -> tuple[Fits, list[str]]:
     """Hold parameters that the data does not determine at their nominal values, as long as the fit stays as good.
 
     Returns:
         The fits, and a sentence for each held parameter.
     """
-    estimate, groups, sentences = fits.estimate, check.undetermined, list[str]()
-    table, tried, data = estimate.problem.table, set[str](), (inputs.model, inputs.episodes, inputs.fitted)
+    inputs, estimate, groups, sentences = fits.inputs, fits.estimate, check.undetermined, list[str]()
+    table, tried = estimate.problem.table, set[str]()
     absent = [n for n, verdict in zip(table.names, spread.verdict, strict=True) if verdict in (ABSENT, NOT_REACHED)]
-    config, able = inputs.config, {p.name for p in table if p.kind == "dynamics" and not p.term}
+    able = {p.name for p in table if p.kind == "dynamics" and not p.term}
     while names := [n for group in groups for n in group if n in able - tried]:
         # Begin with parameters that a model may be without, such as an inertia of the rotor.
         name = min(names, key=lambda n: not table[n].vanishes)
         tried.add(name)
         held = estimate.problem.table.with_fixed({name: table[name].nominal})
         end = estimate.x[[c.name != name for c in estimate.problem.table.columns]]
-        again = fitted_to(*data, inputs.windows, config, held, end=end)
+        again = fit_to(replace(inputs, table=held), end=end)
         if not again.converged or again.loss > (1.0 + _AS_GOOD) * estimate.loss:
             continue
         estimate = again
@@ -126,66 +196,22 @@ def determined(inputs: Inputs, fits: Fits, check: Determined, spread: Uncertaint
     return replace(fits, estimate=estimate), sentences
 
 
-def fitted_to(
-    model: IdentifiableModel,
-    episodes: Sequence[Episode],
-    fitted: int,
-    windows: Sequence[Span],
-    config: IdentifyConfig,
-    table: ParameterTable,
-    report: OnProgress | None = None,
-    on_begin: Callable[[Problem], None] | None = None,
-    as_start: bool = False,
-    end: np.ndarray | None = None,
-) -> Fit:
-    """Return the fit of a model to logs.
-
-    Args:
-        windows: Segments to fit, and segments to predict.
-        as_start: Whether it only has to be a start for fits with some of the optional terms.
-        end: Where a fit of nearly this model ended, as in ``fit``.
-    """
-    longer, length_s = long_spans(episodes, fitted, config), config.settle_s + config.horizon_s
-    return fit(model, list(episodes), windows, length_s, config, table, longer, report, on_begin, as_start, end)
-
-
-def chosen(
-    estimate: Fit,
-    config: IdentifyConfig,
-    names: Sequence[str],
-    refits: Refits | None = None,
-    on_set: Callable[[str], None] = lambda names: None,
-) -> Selection:
-    """Return the optional terms without which held-out parts are predicted worse.
-
-    Args:
-        estimate: The fit with all optional terms.
-        names: A name for each recording; recordings of different names are different parts.
-        refits: Finished refits, which are not computed again.
-        on_set: Called with the names of each set of terms before it is fitted.
-    """
-    parts = parts_of(estimate, config, names, _LEAST_TO_CHOOSE)
-    trials = TermSearch(estimate, parts, config.settle_s, config.free_run_s, refits, on_set)
-    if trials.segments < (count := len(estimate.problem.train)):
-        note(f"sets of terms are compared on {trials.segments} of {count} segments, those with most motion")
-    return trials.select()
-
-
-def without_parts(inputs: Inputs, fits: Fits) -> tuple[HeldOutPart, ...]:
+def without_parts(fits: Fits) -> tuple[HeldOutPart, ...]:
     """Return the estimates without each part of the recordings, and their errors on that part.
 
     There are none without a converged fit, whose errors would bound no later error.
     """
-    config, estimate = inputs.config, fits.widest
-    if not (config.folds and fits.estimate.converged):
+    inputs, estimate = fits.inputs, fits.estimate
+    config = inputs.config
+    if not (config.folds and estimate.converged):
         return ()
-    if (segments := len(estimate.problem.train)) < LEAST_SEGMENTS:
-        note(f"{segments} segments are too few to hold parts out of the fit")
+    if not has_parts(inputs, estimate):
+        note(f"{len(estimate.problem.train)} segments are too few to hold parts out of the fit")
         return ()
-    if fits.selection is not None:  # the trials have these errors
-        return tuple(fits.selection.chosen.rows)
+    if fits.parts is not None:
+        return fits.parts
     parts = parts_of(estimate, config, inputs.names)
-    return tuple(leave_out(estimate, parts, config.settle_s, config.free_run_s, inputs.refits))
+    return tuple(leave_out(estimate, parts, config.settle_s, config.free_run_s))
 
 
 def parts_of(estimate: Fit, config: IdentifyConfig, names: Sequence[str], least: int = 2) -> list[Fold]:

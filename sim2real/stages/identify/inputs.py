@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-import sim2real
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run import Source, portable
 from sim2real.errors import OtherMotion
 from sim2real.graph.episode import Episode
 from sim2real.identification.delays import measured
-from sim2real.identification.held_out import REFITS, Refits
 from sim2real.identification.model import IdentifiableModel, measured_channels
 from sim2real.identification.parameters import ParameterTable
 from sim2real.identification.segments import Span
@@ -32,11 +28,7 @@ from sim2real.stages.shared.identification import (
 )
 from sim2real.stages.terminal.console import note
 
-_WITHOUT_EFFECT = (
-    *("log", "hold_out", "begin", "standing", "force", "each", "links", "reveal", "view"),
-    *("strategy", "population", "generations", "std", "refine_steps", "seed"),
-)
-"""Settings on which no refit depends: a refit starts from the fit, wherever that was found. Logs count by content."""
+Bounds = Mapping[str, tuple[float, float]]
 
 
 @dataclass(frozen=True)
@@ -50,7 +42,6 @@ class Inputs:
         logs: The fitted recordings, then those that are held out whole.
         hashes: SHA-256 of each log's file before the fit; "" for a recording without a file.
         windows: Segments to fit, and segments to predict.
-        refits: Finished refits without parts of the recordings.
         standing: The recording of a robot on its feet; None: there is none.
     """
 
@@ -63,24 +54,12 @@ class Inputs:
     hashes: tuple[str, ...]
     fitted: int
     windows: list[Span]
-    refits: Refits = field(default_factory=Refits)
     standing: Recording | None = None
 
     @property
     def undetermined(self) -> tuple[str, ...]:
         """Parameters of training that no log of the robot determines."""
         return tuple(self.robot.model.unidentified()) if isinstance(self.robot, Robot) else ()
-
-    @property
-    def digest(self) -> str:
-        """Digest of all that the refits depend on: fitted logs, robot, parameters, settings and this version."""
-        config = {k: v for k, v in asdict(self.config).items() if k not in _WITHOUT_EFFECT}
-        rows = [
-            (replace(p, prior=None, begin=None), p.prior and [float(p.prior.log_prob(v)) for v in (p.low, p.high)])
-            for p in self.table
-        ]
-        whole = (config, rows, self.hashes[: self.fitted], sim2real.__version__)
-        return hashlib.sha256(repr(whole).encode()).hexdigest()
 
     def sources(self, run_dir: Path | None = None) -> tuple[Source, ...]:
         """Return the logs with their hashes from before the fit.
@@ -159,24 +138,24 @@ def with_load(
         return document
 
 
-@contextmanager
-def storing_refits(inputs: Inputs, folder: Path, root: Path) -> Iterator[Inputs]:
-    """Yield the inputs with finished refits in a stage's folder, and those of earlier folders of the same inputs.
-
-    Args:
-        root: Folder of all runs.
-    """
-    files = (root / inputs.loaded.name).glob(f"*/identify*/{REFITS}")
-    refits = Refits(folder / REFITS, inputs.digest, sorted(files, key=lambda f: f.stat().st_mtime, reverse=True))
-    try:
-        yield replace(inputs, refits=refits)
-    finally:
-        refits.close()
-
-
 def configured(robot: RecordedRobot, config: IdentifyConfig) -> RecordedRobot:
     """Return a robot in the configured world, with the optional terms that the configuration names."""
     return offering(in_world(robot, config.world), config.terms)
+
+
+def with_terms(inputs: Inputs, wanted: str, selected: str = "", bounds: Bounds | None = None) -> Inputs:
+    """Return the inputs of the robot with optional terms; the settings stay.
+
+    Args:
+        wanted: The terms that the robot offers, as in ``offering``.
+        selected: Those among them that are identified; default: the wanted ones.
+        bounds: Further bounds.
+    """
+    robot = configured(inputs.loaded, replace(inputs.config, terms=wanted))
+    model = measured_channels(robot.identifiable(inputs.config.max_delay_s), inputs.episodes)
+    config = replace(inputs.config, terms=selected or wanted, bounds={**inputs.config.bounds, **(bounds or {})})
+    table = table_of(model, config, inputs.episodes[: inputs.fitted])
+    return replace(inputs, robot=robot, model=model, table=table)
 
 
 def table_of(model: IdentifiableModel, config: IdentifyConfig, episodes: Sequence[Episode]) -> ParameterTable:

@@ -21,7 +21,7 @@ from sim2real.artifacts.identification import (
     Identification,
     Judgement,
     Noise,
-    TriedTerm,
+    WorstSecond,
     with_small_unit,
 )
 from sim2real.artifacts.posterior import Posterior
@@ -31,13 +31,11 @@ from sim2real.identification import verdict
 from sim2real.identification.delays import links
 from sim2real.identification.expected import wider_for, with_expected_errors
 from sim2real.identification.fit import Fit, as_numbers, refine, refit
-from sim2real.identification.model import IdentifiableModel, measured_channels
-from sim2real.identification.parameters import ParameterTable
 from sim2real.identification.predictions import Position, positions, replays, worst_second
 from sim2real.identification.problem import Problem, few_of
 from sim2real.identification.residuals import Linearised
-from sim2real.identification.segments import Span, beyond, ranges
-from sim2real.identification.terms import TermSearch, gains
+from sim2real.identification.segments import Span, extents
+from sim2real.identification.terms import MENDS
 from sim2real.identification.uncertainty import (
     ABSENT,
     NOT_REACHED,
@@ -48,22 +46,15 @@ from sim2real.identification.uncertainty import (
 )
 from sim2real.identification.uncertainty import determined as what_is_determined
 from sim2real.identification.uncertainty import widening as posterior_widening
-from sim2real.identification.verdict import ACCEPTED, CHANGE, NO_DELAY, Lack, scores, state_of
+from sim2real.identification.verdict import ACCEPTED, CHANGE, NO_DELAY, RECORD, Lack, scores, state_of
+from sim2real.log.importing.checks import check_episode
 from sim2real.stages.identify.config import IdentifyConfig
-from sim2real.stages.identify.fitting import (
-    LEAST_SEGMENTS,
-    Fits,
-    determined,
-    fitted_to,
-    parts_of,
-    widened,
-    without_parts,
-)
-from sim2real.stages.identify.inputs import Inputs, configured, table_of, with_load
+from sim2real.stages.identify.fitting import Fits, determined, has_parts, widened, without_parts
+from sim2real.stages.identify.inputs import Inputs, configured, with_load, with_terms
 from sim2real.stages.identify.true_values import true_values
 from sim2real.stages.load import defaults_of
 from sim2real.stages.shared.identification import split_of, usable
-from sim2real.stages.terminal.console import note, progress, shown
+from sim2real.stages.terminal.console import progress
 from sim2real.stages.terminal.interruption import patiently
 
 _NO_DELAY_S = 1e-4
@@ -76,12 +67,10 @@ _FAR = 3.0
 """Ratio of residuals to noise above which a term is missing."""
 _FLOOR = 0.1
 """Smallest noise, in assumed deviations of a measurement: simulated logs have none, and residuals of integrators."""
-_FAR_RUN = 0.1
-"""Error of a free run, as a share of the position's range, above which a term is missing."""
-_MENDS = 0.5
-"""The model lacks a term if the error with it is below this share."""
-_USUAL_TERM = "direction"
-"""A constant force, or friction that differs by direction: the term that models lack most often."""
+_ALONE = 1.5
+"""Ratio of the error in the worst second to a joint's whole error from which on a fault is in that second."""
+_PROMISING = 0.95
+"""Ratio of the residuals with turned gravity to those without, by linear algebra, above which no turn is tried."""
 _GRAVITY = 10.0
 """Ratio of residuals to noise above which other directions of gravity are tried."""
 _TILT, _TURNS = "tilt", (-1.6, -0.8, -0.3, 0.3, 0.8, 1.6, 3.1)
@@ -95,25 +84,22 @@ _CAUSES = (
 )
 
 
-def judge(inputs: Inputs, fits: Fits, started_s: float) -> Identification:
+def judge(fits: Fits, started_s: float) -> Identification:
     """Return the estimates with intervals, predictions, free runs and a verdict; the caller adds logs and timing.
 
     Args:
         started_s: When the fit began [s on ``time.monotonic``].
     """
-    config = inputs.config
+    inputs, config = fits.inputs, fits.inputs.config
     with progress(None, "identify: held-out parts") as bar:
         # Refit without each part of the recordings.
-        parts = patiently(lambda: without_parts(inputs, fits))
-        if inputs.refits.source and inputs.refits.reused:
-            same = "logs, parameters and settings are the same"
-            note(f"{inputs.refits.reused} refits are from {shown(inputs.refits.source)}: {same}")
+        parts = patiently(lambda: without_parts(fits))
         # Compute intervals; they widen where estimates without one part differ.
         bar.set_description_str("identify: intervals")
         findings, held = patiently(lambda: Findings.of(fits.estimate, parts)), list[str]()
         # A choice of the model includes which parameters it has: hold those that the data does not determine.
-        if config.terms == "auto" and fits.estimate.converged and findings.check.undetermined:
-            fits, held = patiently(lambda f=findings: determined(inputs, fits, f.check, f.spread))
+        if (config.terms == "auto" or fits.added) and fits.estimate.converged and findings.check.undetermined:
+            fits, held = patiently(lambda f=findings: determined(fits, f.check, f.spread))
             findings = patiently(lambda: Findings.of(fits.estimate, parts)) if held else findings
         fit = findings.fit
         truth = true_values(inputs.logs[0]) if config.reveal else {}
@@ -126,22 +112,22 @@ def judge(inputs: Inputs, fits: Fits, started_s: float) -> Identification:
         several = config.each and inputs.fitted > 1
         aggregate = patiently(lambda: compare_recordings(fit.problem, findings.at)) if several else ()
         links_ = patiently(lambda: links(fit.problem, fit.x)) if config.links else ()
-        document = replace(document, left_out=parts, terms=fits.terms, links=links_, aggregate=aggregate)
-        # Try further terms where residuals are far above the noise.
-        bar.set_description_str("identify: terms that may be missing")
-        if fits.selection is not None:
-            tried = gains(fits.selection, fits.widest.problem.table)
-            document = replace(document, tried=tried)
-        document, lacks = patiently(lambda: lack(document, inputs, fit))
+        document = replace(
+            document, left_out=parts, terms=fits.terms, tried=fits.tried, links=links_, aggregate=aggregate
+        )
+        bar.set_description_str("identify: what the model lacks")
+        lacks = patiently(lambda: lack(document, fits))
     if inputs.standing is not None:
         document = with_load(document, inputs.robot, inputs.standing, truth)
-    document, outside = _compared(document, inputs, fit, parts)
+    document = _compared(document, inputs, fit, parts)
     names = [n for n in inputs.undetermined if n not in document.values]
     # The robot's own bounds may be widened once.
     usual = defaults_of(inputs.loaded).identify.bounds
     set_by_user = {n for n, both in config.bounds.items() if usual.get(n) != both}
     open_ = [f"not determined by this log: {', '.join(names)}"] if names else []
-    return _judged(document, findings, inputs, [*outside, *held, *open_], lacks, set_by_user)
+    if fits.added:
+        held.insert(0, f"the term {fits.added} is part of the model: without it the errors are at least twice as large")
+    return _judged(document, findings, inputs, [*held, *open_], lacks, set_by_user)
 
 
 @dataclass(frozen=True)
@@ -330,49 +316,40 @@ def free_runs(
     return rows, columns, replays(problem, estimate.values, config.settle_s, "free")
 
 
-def _compared(
-    document: Identification, inputs: Inputs, fit: Fit, parts: Sequence[HeldOutPart]
-) -> tuple[Identification, list[str]]:
-    """Return the document with expected errors and ranges, and sentences about held-out data outside the ranges."""
+def _compared(document: Identification, inputs: Inputs, fit: Fit, parts: Sequence[HeldOutPart]) -> Identification:
+    """Return the document with expected errors, and ranges of the fitted motion."""
     names, measured = [log.path.stem for log in inputs.logs], positions(inputs.model, inputs.units)
     fitted = [s for s in inputs.windows if s.fitted]
     held_out = [[s for s in inputs.windows if s.recording == r and not s.fitted] for r in range(len(inputs.logs))]
-    before, *later = (ranges(inputs.model, inputs.episodes, s, fit.windows.segment_s) for s in (fitted, *held_out))
-    document = replace(document, ranges=before)
+    before, *later = (extents(inputs.model, inputs.episodes, s, fit.windows.segment_s) for s in (fitted, *held_out))
+    document = replace(document, motion=before)
     wider = [wider_for(before, log, measured) for log in later]
-    document = with_expected_errors(document, measured, parts, names, inputs.fitted, wider)
-    outside = dict.fromkeys(text for log in later for text in beyond(before, log))
-    return document, [f"held-out data extrapolates: {text}" for text in outside]
+    return with_expected_errors(document, measured, parts, names, inputs.fitted, wider)
 
 
-def lack(document: Identification, inputs: Inputs, fit: Fit) -> tuple[Identification, Lack]:
-    """Return the document with the tried terms, and what the model lacks.
+def lack(document: Identification, fits: Fits) -> Lack:
+    """Return what a model lacks: by residuals far above the noise, another direction of gravity, and free runs.
 
-    Where residuals are far above the noise, further terms are compared on held-out parts, one at a time, and other
-    directions of gravity. Where free runs are far off, the model is fitted with the best of these terms.
+    Args:
+        document: With samples, free runs and the tried terms.
     """
-    measured, term = positions(inputs.model, inputs.robot.units), _USUAL_TERM
-    chosen, automatic = [*(document.terms or ())], inputs.config.terms == "auto"
+    inputs, fit = fits.inputs, fits.estimate
+    measured, chosen = positions(inputs.model, inputs.robot.units), [*(document.terms or ())]
     reasons, flags, unexplained = list[str](), "", False
     worst = largest_residual(document, noises(document.samples, inputs.units), measured)
     if worst is not None and worst[1] > _FAR:
         position, ratio, level = worst
         unit = f" {position.unit}".rstrip()
         sentence = f"residuals of {position.name} are {ratio:.2g} times its noise of {level:.2g}{unit}"
-        # The terms of ``auto`` were compared already.
-        if not automatic and _has_parts(inputs, fit):
-            tried = inputs.refits.tried(fit.problem.table.terms, lambda: _tried(inputs, fit))
-            document = replace(document, tried=tried)
-        best = next((t for t in document.tried if t.outcome == "mends"), None)
+        best = next((t for t in document.tried if t.outcome == "mends" and t.term not in chosen), None)
         if not document.tried:
             reasons.append(f"{sentence}: the model lacks something; no optional term was tried")
-        elif automatic or best is None:
-            none = "no further term" if automatic else "none of the terms that were tried, one at a time,"
-            reasons.append(f"{sentence}; {none} lowers the error on held-out parts by 5 %")
+        elif best is None:
+            reasons.append(f"{sentence}; no further term lowers the error on held-out parts by a tenth")
         else:
-            term, gain, with_it = best.term, best.gain or 0.0, f"--terms {','.join([*chosen, best.term])}"
-            flags = with_it if gain > 1.0 - _MENDS else ""
-            reasons.append(f"{sentence}; {term} lowers the error on held-out parts by {gain:.0%}: {with_it}")
+            gain, with_it = best.gain or 0.0, f"--terms {','.join([*chosen, best.term])}"
+            flags = with_it if gain > 1.0 - MENDS else ""
+            reasons.append(f"{sentence}; {best.term} lowers the error on held-out parts by {gain:.0%}: {with_it}")
         # A base that is mounted at an angle bends all other parameters.
         if ratio > _GRAVITY and not flags and fit.converged and (leaning := inclined(inputs, fit)) is not None:
             share, turns, flags = leaning
@@ -384,28 +361,14 @@ def lack(document: Identification, inputs: Inputs, fit: Fit) -> tuple[Identifica
             )
         if unexplained := ratio > _UNEXPLAINED:
             reasons[-1] += f"; parameters that explain so little are no estimates: {_CAUSES}"
-    if (run := farthest_run(document, measured)) is None:
-        return document, Lack(tuple(reasons), flags, unexplained)
-    # Describe the free runs, and fit the model with a further term where they are far off.
-    position, error, share = run
-    size = "diverges"
-    if math.isfinite(error):
-        size = f"is off by {with_small_unit(error, position.unit)}, {share:.1%} of its range"
-    seconds = max(r.seconds for r in document.free_run if r.held_out and r.field == position.column)
-    reasons.append(f"in free runs of {seconds:.3g} s on held-out data {position.name} {size}")
-    wanted, rows = ",".join([*chosen, term]), None
-    if share > _FAR_RUN and not (automatic or term in chosen) and fit.converged and _TILT not in flags:
-        rows = _free_runs_with(inputs, wanted, term)
-    if rows is not None:
-        mended = mean_error(rows, position)
-        if mended is None or not mended < _MENDS * error:
-            reasons.append(f"the term {term} does not mend that")
-        else:
-            such = ", such as a constant force," if term == _USUAL_TERM else ""
-            size = with_small_unit(mended, position.unit)
-            reasons.append(f"with the term {term}{such} it would be off by {size}: the model lacks it")
-            flags = f"--terms {wanted}"
-    return document, Lack(tuple(reasons), flags, unexplained)
+    if (run := farthest_run(document, measured)) is not None:
+        position, error, share = run
+        size = "diverges"
+        if math.isfinite(error):
+            size = f"is off by {with_small_unit(error, position.unit)}, {share:.1%} of its range"
+        seconds = max(r.seconds for r in document.free_run if r.held_out and r.field == position.column)
+        reasons.append(f"in free runs of {seconds:.3g} s on held-out data {position.name} {size}")
+    return Lack(tuple(reasons), flags, unexplained)
 
 
 def inclined(inputs: Inputs, fit: Fit) -> tuple[float, dict[str, float], str] | None:
@@ -416,17 +379,20 @@ def inclined(inputs: Inputs, fit: Fit) -> tuple[float, dict[str, float], str] | 
     """
     config, chosen = inputs.config, fit.problem.table.terms
     wanted = ",".join([*chosen, _TILT])
-    model = _model_with(inputs, wanted)
-    turns = [p.name for p in model.parameters if p.term == _TILT]
+    offered = configured(inputs.loaded, replace(config, terms=wanted)).identifiable(config.max_delay_s)
+    turns = [p.name for p in offered.parameters if p.term == _TILT]
     if not turns or _TILT in chosen or set(turns) & set(config.fix):
         return None
-    table = _table_with(inputs, model, wanted, dict.fromkeys(turns, (-math.pi, math.pi)))
-    if not set(fit.values) <= {p.name for p in table}:
+    tilted = with_terms(inputs, wanted, bounds=dict.fromkeys(turns, (-math.pi, math.pi)))
+    if not set(fit.values) <= {p.name for p in tilted.table}:
         return None
     length_s = config.settle_s + config.horizon_s
-    problem = few_of(Problem(model, inputs.episodes, inputs.windows, length_s, config, table))
+    problem = few_of(Problem(tilted.model, inputs.episodes, inputs.windows, length_s, config, tilted.table))
     estimate = problem.table.encode({p.name: p.without for p in problem.table} | fit.values)
     columns = np.array([c.name in turns for c in problem.table.columns])
+    # Nothing is searched for unless a small turn would help, by linear algebra.
+    if not _promises(problem.linearise(estimate), columns):
+        return None
     starts = []
     for x in (estimate, problem.table.start()):
         candidates = np.repeat(x[None], 1 + len(_TURNS) * int(columns.sum()), axis=0)
@@ -439,16 +405,19 @@ def inclined(inputs: Inputs, fit: Fit) -> tuple[float, dict[str, float], str] | 
         return None
     before = refine(problem, estimate[None], problem.part(present=~columns), coarse=True)
     after = refine(problem, np.stack(starts), coarse=True)
-    if not after.loss < _MENDS**2 * before.loss:
+    if not after.loss < MENDS**2 * before.loss:
         return None
     values = as_numbers(problem.table, after.x)
     flags = [f"--terms {wanted}", *(f"--bounds {name} -3.15 3.15" for name in turns)]
     return 1.0 - after.loss / before.loss, {n: float(np.ravel(values[n])[0]) for n in turns}, " ".join(flags)
 
 
-def _has_parts(inputs: Inputs, fit: Fit) -> bool:
-    """Return whether parts of the recordings are held out, on which terms are compared."""
-    return bool(fit.converged and inputs.config.folds and len(fit.problem.train) >= LEAST_SEGMENTS)
+def _promises(at: Linearised, columns: np.ndarray) -> bool:
+    """Return whether a linear step of some parameters beside all others lowers the residuals by 5 % more."""
+    J, r = at.jacobian.reshape(-1, len(at.x)), at.residuals.reshape(-1)
+    left = [np.linalg.norm(r - J[:, which] @ np.linalg.lstsq(J[:, which], r, rcond=None)[0]) for which in (
+        ~columns, np.ones_like(columns))]  # fmt: skip
+    return bool(left[1] < _PROMISING * left[0])
 
 
 def largest_residual(
@@ -483,40 +452,6 @@ def mean_error(rows: Sequence[FreeRun], position: Position) -> float | None:
     return float(np.mean(errors)) if errors else None
 
 
-def _tried(inputs: Inputs, fit: Fit) -> tuple[TriedTerm, ...]:
-    """Return what optional terms gain, one at a time, beside the model of a fit.
-
-    The three most promising ones by linear algebra and the limits are fitted, without refits: about as long as the fit.
-    """
-    config, chosen = inputs.config, fit.problem.table.terms
-    model = _model_with(inputs, ",".join(["auto", *chosen]))
-    table = _table_with(inputs, model, "all")
-    further = set(table.terms) - set(chosen)
-    if not further or not set(fit.values) <= {p.name for p in table}:
-        return ()
-    # Put the estimate into the model with all terms, and compare single terms.
-    length_s = config.settle_s + config.horizon_s
-    problem = Problem(model, inputs.episodes, inputs.windows, length_s, config, table)
-    values = {p.name: p.without for p in problem.table} | fit.values
-    x = problem.table.encode(values)
-    whole = replace(fit, problem=problem, windows=problem, x=x, refined=(), search=None)
-    parts = parts_of(whole, config, inputs.names)
-    present = np.array([name in chosen for name in problem.table.terms])
-    selection = TermSearch(whole, parts, config.settle_s, 0.0).further(x, present)
-    return tuple(r for r in gains(selection, problem.table) if r.term in further)
-
-
-def _free_runs_with(inputs: Inputs, wanted: str, term: str) -> Sequence[FreeRun] | None:
-    """Return the free runs of the model with further terms; None if the robot has no free parameter of the last one."""
-    config, model = replace(inputs.config, terms=wanted, generations=0), _model_with(inputs, wanted)
-    if {p.name for p in model.parameters if p.term == term} <= set(config.fix):
-        return None
-    # Search from the start, as the printed command does: a fit without the term has distorted other parameters.
-    table, episodes = _table_with(inputs, model, wanted), inputs.episodes
-    refitted = fitted_to(model, episodes, inputs.fitted, inputs.windows, config, table)
-    return free_runs(refitted, episodes, inputs.fitted, config, {"identified": refitted.values})[0]
-
-
 def _judged(
     document: Identification,
     findings: Findings,
@@ -528,12 +463,18 @@ def _judged(
     """Return the document with its verdict, whose ``next`` are flags with which to identify again.
 
     Args:
-        doubts: Sentences about held-out data outside the range of the fitted data, and parameters that are held.
+        doubts: Sentences about parameters that are held, and terms.
         set_by_user: Parameters whose bounds the user has set.
     """
     fit, measured = findings.fit, positions(findings.fit.problem.model, inputs.units)
     rows = scores(document.prediction, measured)
     above = [str(row) for row in sorted(document.compared, key=lambda r: -(r.ratio or 0.0)) if row.exceeded]
+    # A fault in fitted data changes no held-out error, so it does not change the status; it may be why nothing else is
+    # explained.
+    worst = worst_second(document.samples, measured, document.settle_s)
+    fault, alone = _fault(worst, document)
+    if alone and lacks.unexplained:
+        lacks = replace(lacks, reasons=(fault, *lacks.reasons))
     judged = verdict.judge(
         rows,
         fit.problem.table,
@@ -542,41 +483,44 @@ def _judged(
         findings.check,
         max_delay_s=inputs.config.max_delay_s,
         widened=fit.problem.table.names if lacks.flags else set_by_user,
-        beyond=doubts,
+        doubts=doubts,
         left=None if fit.converged else fit.left,
         exceeded=above[:_MOST] + [f"{len(above) - _MOST} more errors are above"] * (len(above) > _MOST),
         lacks=lacks,
     )
-    status, reasons, flags = judged.status, list(judged.reasons), judged.next
+    status, flags, why = judged.status, judged.next, judged.reasons
+    # No model explains a motion between commands that the log lacks.
+    if status == CHANGE and (slow := _slow_commands(inputs)):
+        status, flags, why = RECORD, "", (slow, *why)
     if status == CHANGE and not (flags or lacks.unexplained) and _offers_more(inputs, fit):
         flags = "--terms auto"
-    # A fault in fitted data changes no held-out error, so it does not change the status.
-    worst = worst_second(document.samples, measured, document.settle_s)
-    if worst is not None and worst.unexplained:
-        where = f"the model does not explain {worst.name} in the second from {worst.begin_s:.1f} s on: {worst.error}"
-        reasons.append(f"{where}; look at the log there")
+    reasons = tuple(dict.fromkeys([*why, *([fault] if fault else [])]))
     parameters = document.parameters if status == ACCEPTED else tuple(map(_doubted, document.parameters))
-    judgement = Judgement(status, tuple(reasons), flags)
+    judgement = Judgement(status, reasons, flags)
     return replace(document, verdict=judgement, parameters=parameters, held_out=tuple(rows), worst=worst)
+
+
+def _fault(worst: WorstSecond | None, document: Identification) -> tuple[str, bool]:
+    """Return a sentence about a second that the model does not explain, and whether the joint's others are better."""
+    if worst is None or not worst.unexplained:
+        return "", False
+    off = document.samples[f"{worst.column}_measured"] - document.samples[f"{worst.column}_identified"]
+    alone = worst.rmse is None or worst.rmse > _ALONE * float(np.sqrt(np.nanmean(off**2)))
+    where = f"the model does not explain {worst.name} in the second from {worst.begin_s:.1f} s on: {worst.error}"
+    return f"{where}; look at the log there", alone
+
+
+def _slow_commands(inputs: Inputs) -> str:
+    """Return a sentence on a fitted log whose commands are logged too seldom for its motion; "": there is none."""
+    for log in inputs.logs[: inputs.fitted]:
+        for finding in check_episode(log.episode):
+            if finding.kind == "rate":
+                return f"{log.path.name}: {finding.text}"
+    return ""
 
 
 def _offers_more(inputs: Inputs, fit: Fit) -> bool:
     """Return whether ``--terms auto`` would compare terms that the model lacks."""
-    config = inputs.config
-    if config.terms == "auto" or not _has_parts(inputs, fit):
+    if inputs.config.terms == "auto" or not has_parts(inputs, fit):
         return False
-    return bool({p.term for p in _model_with(inputs, "auto").parameters if p.term} - set(fit.problem.table.terms))
-
-
-def _model_with(inputs: Inputs, wanted: str) -> IdentifiableModel:
-    """Return the model of the robot with optional terms; see ``offering``."""
-    robot = configured(inputs.loaded, replace(inputs.config, terms=wanted))
-    return measured_channels(robot.identifiable(inputs.config.max_delay_s), inputs.episodes)
-
-
-def _table_with(
-    inputs: Inputs, model: IdentifiableModel, wanted: str, bounds: Mapping[str, tuple[float, float]] | None = None
-) -> ParameterTable:
-    """Return the parameters of a model with optional terms, and with further bounds."""
-    config = replace(inputs.config, terms=wanted, bounds={**inputs.config.bounds, **(bounds or {})})
-    return table_of(model, config, inputs.episodes[: inputs.fitted])
+    return bool({p.term for p in with_terms(inputs, "auto", "all").table if p.term} - set(fit.problem.table.terms))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from sim2real.artifacts.files import number
 from sim2real.artifacts.identification import ROUND_TRIP, Identification, links_table, tried_table, with_small_unit
 from sim2real.stages.terminal.console import artifact_table, note
@@ -62,25 +60,15 @@ def expected_error(identification: Identification) -> str:
 
 
 def summary(identification: Identification) -> dict[str, str]:
-    """Return the lines that the console shows at the end: name -> text. Of several positions it is the worst one."""
-    # The logs and the sum of the delays.
+    """Return the lines that the console shows at the end: name -> text."""
     logs, search = identification.logs, identification.search
     lines = {"log": logs[0].path if len(logs) == 1 else f"{len(logs)} logs, the first {logs[0].path}"}
     if total := next((p for p in identification.parameters if p.name == ROUND_TRIP), None):
         lines["round trip delay"] = f"{1e3 * total.estimate:.1f} ms"
-    # The worst error on held-out data.
-    if identification.held_out:
-        worst = identification.held_out[0]
-        count, unit = len(identification.held_out), f" {worst.unit}".rstrip()
-        which = worst.name + (f", the worst of {count}" if count > 1 else "")
-        lines["position"] = f"{which}, on held-out data"
-        for model, error in worst.rmse.items():
-            if error is not None:
-                lines[f"{model}, {worst.seconds:g} s ahead"] = f"{error:.4f}{unit}"
-        for model in ("identified", "hold"):
-            runs = [r for r in identification.free_run if r.field == worst.column and r.model == model]
-            if runs:
-                lines[f"{model}, free run"] = f"{np.mean([number(r.rmse) for r in runs]):.4f}{unit}"
+    for worst in identification.held_out[:1]:
+        size = "diverges" if worst.error is None else with_small_unit(worst.error, worst.unit)
+        lines["error on held-out data"] = f"{worst.name} {size} {worst.seconds:.3g} s ahead"
+    lines["expected error"] = expected_error(identification)
     lines["verdict"] = identification.verdict.status
     lines["search"] = f"{search.evaluations} candidates in {number(search.seconds):.0f} s"
     return lines

@@ -12,18 +12,17 @@ from typing import Any
 from sim2real.artifacts.identification import PARAMETERS, Identification
 from sim2real.artifacts.run import OpenStage, StageFolder, newest, open_stage
 from sim2real.errors import UsageError
-from sim2real.identification.held_out import REFITS
 from sim2real.identification.uncertainty import noises
 from sim2real.robots.robot import RecordedRobot, Robot
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.identify.fitting import fit_model
-from sim2real.stages.identify.inputs import Inputs, configured, prepare, storing_refits
+from sim2real.stages.identify.inputs import Inputs, prepare
 from sim2real.stages.identify.judgement import judge
 from sim2real.stages.identify.progress import PARTIAL, Best, kept
 from sim2real.stages.identify.show import show, summary
 from sim2real.stages.load import AnyRobot, defaults_of, robot_of
 from sim2real.stages.shared.arguments import AnyRecording, config_of, open_recording, recordings_of
-from sim2real.stages.shared.identification import command, continuing
+from sim2real.stages.shared.identification import command, continuing, identified_robot
 from sim2real.stages.terminal.console import progress, shown
 
 
@@ -68,7 +67,7 @@ def _identify(inputs: Inputs, best: Best) -> Identification:
     # Fit, then write the fit down before it is judged, which takes longer than the fit.
     fits = fit_model(inputs, best)
     best.fitted(fits.estimate.x, fits.estimate.loss)
-    identification = judge(inputs, fits, started_s)
+    identification = judge(fits, started_s)
     return replace(
         identification,
         logs=inputs.sources(),
@@ -85,7 +84,6 @@ def run(robot: RecordedRobot, config: IdentifyConfig, root: Path, run_dir: Path 
     Args:
         run_dir: Run folder to add to; None takes the one of the log.
     """
-    wanted = configured(robot, config)
     paths, run_dir = find_logs(robot, config, root, run_dir)
     # Refuse wrong flags, logs that are given twice and logs that are too short before a folder is made.
     begin = _begin(config.begin, robot) if config.begin else None
@@ -99,12 +97,9 @@ def run(robot: RecordedRobot, config: IdentifyConfig, root: Path, run_dir: Path 
     files |= {"standing": standing} if standing else {}
     with (
         open_stage(root, robot.name, "identify", config, files, run_dir) as stage,
-        storing_refits(inputs, stage.folder, root) as inputs,
         kept(stage, inputs, continuing(robot, config, root, stage.folder / PARTIAL)) as best,
     ):
         identification = _identify(inputs, best)
-        if inputs.refits.stored:
-            stage.output("refits", REFITS)
         # Complete the verdict's flags to a command, and name the logs by their paths in the run folder.
         flags = identification.verdict.next
         again = command(robot, config, root, flags) if flags else ""
@@ -113,7 +108,7 @@ def run(robot: RecordedRobot, config: IdentifyConfig, root: Path, run_dir: Path 
         verdict = replace(identification.verdict, next=again)
         identification = replace(identification, logs=inputs.sources(stage.run_dir), verdict=verdict)
         show(identification, _following(robot, stage, identification))
-        _write(identification, stage, wanted)
+        _write(identification, stage, identified_robot(identification, robot)[0])
         stage.summary(summary(identification))
     return stage.result
 

@@ -315,7 +315,7 @@ def command(robot: RecordedRobot, config: IdentifyConfig, root: Path, flags: str
 
 
 def _exactly(value: float) -> str:
-    """Return a number as a word: finished refits are found again only for the same bounds."""
+    """Return a number as a word, without a change of its value."""
     return short if float(short := f"{value:g}") == value else repr(value)
 
 

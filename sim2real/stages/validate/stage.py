@@ -28,7 +28,7 @@ from sim2real.identification.held_out import moving
 from sim2real.identification.model import IdentifiableModel, measured_channels
 from sim2real.identification.predictions import positions
 from sim2real.identification.problem import Problem
-from sim2real.identification.segments import Span, check_log, ranges
+from sim2real.identification.segments import Span, check_log, extents
 from sim2real.identification.verdict import ACCEPTED, scores
 from sim2real.robots.robot import RecordedRobot, Robot
 from sim2real.stages.identify.config import IdentifyConfig
@@ -249,8 +249,8 @@ def score(
             columns = prediction.samples(windows, values, fitting.settle_s)
             for r, log in enumerate(good):
                 spans = [span for span in windows.spans if span.recording == r]
-                seen = ranges(model, [log.episode for log in good], spans, fitting.settle_s + seconds[r])
-                wider = wider_for(identification.ranges, seen, measured)
+                seen = extents(model, [log.episode for log in good], spans, fitting.settle_s + seconds[r])
+                wider = wider_for(identification.motion, seen, measured)
                 moves = moving(windows, np.flatnonzero(windows.recording == r))
                 moves = dict(zip(prediction.labels(windows), moves, strict=True))
                 of_log = {name: column[columns["recording"] == r] for name, column in columns.items()}
