@@ -87,7 +87,6 @@ class Fit:
         problem: The residuals of the last refinement: on windows, or on longer segments.
         x: Shape ``(P,)``: the estimate, on the parameters' scales.
         search: Result of the search; None if it was skipped.
-        refined: Results of the refinements, in order.
         windows: Segments of the search, and held-out segments of the same length.
         left: Length of the next Gauss-Newton step [standard errors], of the parameter that it moves most.
         converged: Whether the loss has a minimum at the estimate.
@@ -97,7 +96,6 @@ class Fit:
     x: np.ndarray
     loss: float
     search: SearchResult | None
-    refined: tuple[Refined, ...]
     windows: Problem
     left: float
     converged: bool
@@ -161,23 +159,22 @@ def fit(
         starts = np.stack([result.x, *starts])
         x, loss = result.x, result.loss
     # Refine by least squares, first on windows, then on long segments.
-    refined, longer = list[Refined](), bool(config.refine_steps and config.long_s and long_spans)
+    longer, refined = bool(config.refine_steps and config.long_s and long_spans), None
     if config.refine_steps and (end is None or not longer):
         # Where all segments take long, the best of several descents on some of them begins the descent on all.
         few = few_of(problem) if end is None else problem
-        refined += [_refine(few, starts, report)] if few is not problem else []
-        refined.append(_refine(problem, refined[0].x[None] if refined else starts, report))
+        if few is not problem:
+            starts = _refine(few, starts, report).x[None]
+        refined = _refine(problem, starts, report)
+        starts = refined.x[None]
     if longer:
         problem = windows.recut(long_spans, config.long_s or 0.0)
         problem = thinned(problem, of_recordings(problem), MOST_OF_FIT)
-        refined.append(_refine(problem, refined[-1].x[None] if refined else starts, report))
-    # Test whether the end is a minimum.
-    if refined:
-        x, loss, left, converged = refined[-1].x, refined[-1].loss, refined[-1].left, refined[-1].converged
-    else:
-        left = remaining(problem, x)
-        converged = left < _CONVERGED
-    return Fit(problem, x, loss, result, tuple(refined), windows, left, converged)
+        refined = _refine(problem, starts, report)
+    if refined is not None:
+        return Fit(problem, refined.x, refined.loss, result, windows, refined.left, refined.converged)
+    left = remaining(problem, x)
+    return Fit(problem, x, loss, result, windows, left, left < _CONVERGED)
 
 
 def refit(problem: Problem, present: np.ndarray, near: np.ndarray) -> dict[str, float]:

@@ -16,6 +16,8 @@ from sim2real.log.schema import unit_of
 
 GOAL = "told"
 """Name of the baseline that takes the newest goal for the position."""
+_RUNG, _LEAST_RUNG, _SLOWEST_HZ, _DAMPED = 20, 30, 2.5, 0.05
+"""Most segments in which a resonance is looked for, fewest samples of one; lowest frequency; damping ratio."""
 NOISE = 2.0
 """Errors below this many deviations of the measurement count as noise."""
 
@@ -264,3 +266,45 @@ def _segments(samples: Mapping[str, np.ndarray], settle_s: float) -> Iterator[np
     counts = ~samples["held_out"].astype(bool) | (samples["into"] > settle_s)
     for segment in np.unique(samples["segment"][counts]):
         yield np.flatnonzero(counts & (samples["segment"] == segment))
+
+
+def ringing(samples: Mapping[str, np.ndarray], column: str) -> tuple[float, float]:
+    """Return the largest share of a position's residuals that one resonance explains, and its frequency [Hz].
+
+    A transmission that gives way moves the link beside its drive by y, with y'' + 2 d w y' + w^2 y = -q'' for the
+    predicted motion q. At each frequency y and y' are fitted beside speed, acceleration, dry friction and the free
+    oscillation of each segment. Belts explained 0.37 and more, joints of five real robots 0.27 at most.
+    """
+    from scipy.signal import cont2discrete, lfilter  # 0.2 s
+
+    # Put the fitted segments onto one grid of time.
+    chosen = np.unique(samples["segment"][~samples["held_out"].astype(bool)])
+    rows = [np.flatnonzero(samples["segment"] == s) for s in chosen[:: -(-len(chosen) // _RUNG) or 1]]
+    into = [samples["into"][r].astype(np.float64) for r in rows]
+    if not rows or min(map(len, into)) < _LEAST_RUNG:
+        return 0.0, 0.0
+    step_s, length_s = float(np.median(np.diff(into[0]))), min(float(t[-1] - t[0]) for t in into)
+    grid = np.arange(0.0, length_s, step_s)
+    parts = list(zip(into, rows, strict=True))
+    at = lambda name: np.stack([np.interp(grid, t - t[0], samples[name][r]) for t, r in parts])  # noqa: E731
+    predicted = at(f"{column}_identified")
+    off = at(f"{column}_measured") - predicted
+    if not np.isfinite(predicted).all():
+        return 0.0, 0.0
+    speed = np.gradient(predicted, step_s, axis=1)
+    acceleration, best = np.gradient(speed, step_s, axis=1), (0.0, 0.0)
+    for hz in np.geomspace(_SLOWEST_HZ, max(min(0.35 / step_s, 60.0), _SLOWEST_HZ), 25):
+        w = 2.0 * np.pi * float(hz)
+        b, a, _ = cont2discrete(([1.0], [1.0, 2.0 * _DAMPED * w, w * w]), step_s, "foh")
+        beside = lfilter(b.ravel(), a, -acceleration, axis=1)
+        free = np.exp(-_DAMPED * w * grid)
+        own = np.stack([grid**0, grid, free * np.cos(w * grid), free * np.sin(w * grid)], axis=1)
+        basis = np.linalg.qr(own)[0]
+        columns = (speed, acceleration, np.sign(speed), beside, np.gradient(beside, step_s, axis=1))
+        r, *J = (v - v @ basis @ basis.T for v in (off, *columns))
+        J = np.stack([j.ravel() / (np.linalg.norm(j) + 1e-12) for j in J], axis=1)
+        squares = [
+            float(np.sum((r.ravel() - c @ np.linalg.lstsq(c, r.ravel(), rcond=None)[0]) ** 2)) for c in (J[:, :3], J)
+        ]
+        best = max(best, (1.0 - squares[1] / max(squares[0], 1e-300), float(hz)))
+    return best

@@ -56,24 +56,20 @@ class Uncertainty:
     """How uncertain an estimate is.
 
     Attributes:
-        covariance: Shape ``(P, P)``, of the values, in their units.
         scale_covariance: Shape ``(P, P)``, on the parameters' scales.
         standard_error: Shape ``(P,)``.
         low: Shape ``(P,)``: lower end of the 95 % interval, within the bounds.
         high: Shape ``(P,)``: upper end.
         verdict: One a parameter, see ``OK``.
-        correlation: Shape ``(P, P)``.
         misfit: Root mean square of the residuals in deviations of the measurement, without a robust loss: 1 where the
             model explains everything but the noise.
     """
 
-    covariance: np.ndarray
     scale_covariance: np.ndarray
     standard_error: np.ndarray
     low: np.ndarray
     high: np.ndarray
     verdict: tuple[str, ...]
-    correlation: np.ndarray
     misfit: float
 
 
@@ -103,10 +99,7 @@ def _of_covariance(table: ParameterTable, x: np.ndarray, cov: np.ndarray, at: Li
         for m, e in zip(margin, error / table.span, strict=True)
     ]
     misfit = float(np.sqrt(np.sum(at.raw**2) / max(at.count, 1)))
-    return Uncertainty(
-        cov * np.outer(slope, slope), cov, error * np.abs(slope), low, high, tuple(verdicts),
-        cov / np.outer(error, error), misfit,
-    )  # fmt: skip
+    return Uncertainty(cov, error * np.abs(slope), low, high, tuple(verdicts), misfit)
 
 
 def between_parts(

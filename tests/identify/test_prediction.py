@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sim2real.identification.model import Channel
-from sim2real.identification.predictions import errors, free_runs, labels
+from sim2real.identification.predictions import errors, free_runs, labels, ringing
 
 SETTLE_S = 0.2
 
@@ -90,3 +90,27 @@ def test_free_runs_are_whole_segments(columns):
 def test_a_segment_that_ends_while_settling_is_left_out(columns):
     short = {n: c[(columns["segment"] == 1) | (columns["into"] < SETTLE_S)] for n, c in columns.items()}
     assert {r.recording for r in free_runs(short, ["th"], ["model"], SETTLE_S)} == {5}
+
+
+@pytest.mark.parametrize(("resonance_hz", "found"), [(15.0, True), (8.0, True), (None, False)])
+def test_a_belt_rings_where_friction_and_noise_do_not(resonance_hz, found):
+    """A mass on a spring behind a drive that follows a motion, and residuals of dry friction with noise."""
+    rng, step_s, length = np.random.default_rng(0), 0.005, 260
+    t = step_s * np.arange(12 * length)
+    waves, phases = rng.uniform(0.3, 4.0, 8), rng.uniform(0.0, 6.28, 8)
+    q = 0.1 * np.sin(2 * np.pi * waves * t[:, None] + phases).sum(axis=1) + 0.3 * np.sign(np.sin(2.5 * t))
+    q = np.convolve(q, np.hanning(16) / np.hanning(16).sum(), "same")
+    speed, acceleration = np.gradient(q, step_s), np.gradient(np.gradient(q, step_s), step_s)
+    off = 0.01 * np.sign(speed) + 1e-4 * acceleration
+    if resonance_hz:
+        w, y, dy = 2 * np.pi * resonance_hz, np.zeros_like(q), 0.0
+        for k in range(1, len(t)):
+            dy += step_s * (-acceleration[k - 1] - 0.06 * w * dy - w * w * y[k - 1])
+            y[k] = y[k - 1] + step_s * dy
+        off = y
+    segment = np.repeat(np.arange(12), length)
+    samples = {"into": t - t[segment * length], "segment": segment, "held_out": segment >= 9}
+    samples |= {"q_identified": q, "q_measured": q + off + 1e-3 * rng.normal(size=len(t))}
+    share, hz = ringing(samples, "q")
+    assert (share > 1 / 3) == found
+    assert not found or hz == pytest.approx(resonance_hz, rel=0.15)

@@ -37,11 +37,12 @@ def document(times_noise, *runs, tried=(), terms=()):
     )
 
 
-def lacked(found, monkeypatch, leaning=None):
+def lacked(found, monkeypatch, leaning=None, rings=(0.1, 4.0)):
     """Return what a document lacks."""
     monkeypatch.setattr(judgement, "positions", lambda *_: [AXIS, ARM])
     monkeypatch.setattr(judgement, "noises", lambda *_: NOISE)
     monkeypatch.setattr(judgement, "inclined", lambda *_: leaning)
+    monkeypatch.setattr(judgement, "ringing", lambda *_: rings)
     inputs = SimpleNamespace(model=None, units={}, robot=SimpleNamespace(units={}))
     return lack(found, SimpleNamespace(inputs=inputs, estimate=SimpleNamespace(converged=True)))
 
@@ -71,6 +72,13 @@ def test_gravity_of_another_direction_is_named_first_with_its_command(times_nois
     found = lacked(document(times_noise, terms=("drag",)), monkeypatch, leaning)
     assert ("+0.70 rad (tilt_y)" in found.reasons[0]) == named
     assert found.flags == ("--terms tilt" if named else "")
+
+
+@pytest.mark.parametrize(("times_noise", "share", "named"), [(2.0, 0.5, False), (8.0, 0.5, True), (8.0, 0.3, False)])
+def test_a_joint_that_rings_has_no_estimates(times_noise, share, named, monkeypatch):
+    found = lacked(document(times_noise), monkeypatch, rings=(share, 14.6))
+    assert found.unexplained == named
+    assert any("rings at 15 Hz" in reason for reason in found.reasons) == named
 
 
 @pytest.mark.parametrize(

@@ -36,13 +36,11 @@ def known():
     table = ParameterTable([Parameter("gain", "1", 1.0, 0.0, 10.0, "linear")])
     error = np.array([0.01])
     spread = Uncertainty(
-        covariance=np.diag(error**2),
         scale_covariance=np.diag(error**2),
         standard_error=error,
         low=np.array([0.98]),
         high=np.array([1.02]),
         verdict=("ok",),
-        correlation=np.eye(1),
         misfit=1.0,
     )
     return SimpleNamespace(table=table, spread=spread, at=at_point([1.0]))
@@ -55,7 +53,7 @@ def test_estimates_that_differ_between_parts_widen_the_interval_to_the_jackknife
     reach = error * stats.t.ppf(0.975, 4) / stats.norm.ppf(0.975)
     assert found.standard_error[0] == pytest.approx(reach, rel=0.01)
     assert found.high[0] - 1.0 == pytest.approx(1.96 * reach, rel=0.01)
-    assert found.covariance[0, 0] == pytest.approx(reach**2, rel=0.02)
+    assert found.scale_covariance[0, 0] == pytest.approx(reach**2, rel=0.02)
 
 
 @pytest.mark.parametrize(
@@ -77,7 +75,7 @@ def test_what_one_part_alone_determines_widens_as_the_others():
     table = ParameterTable([Parameter(n, "1", 1.0, 0.0, 100.0, "linear") for n in ("gain", "touch")])
     two, error = np.ones(2), 0.01 * np.ones(2)
     square = np.diag(error**2)
-    spread = Uncertainty(square, square, error, 0.98 * two, 1.02 * two, ("ok",) * 2, np.eye(2), 1.0)
+    spread = Uncertainty(square, error, 0.98 * two, 1.02 * two, ("ok",) * 2, 1.0)
     values, shares = np.array([0.9, 1.0, 1.1, 1.05, 0.95]), [0.0, 0.9, 0.1, 0.0, 0.0]
     rows = [
         HeldOutPart(str(k), (), {"gain": v, "touch": 1.0 + 5.0 * s}, {"gain": 0.2, "touch": s}, {"th": 0.1})

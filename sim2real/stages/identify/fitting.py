@@ -152,7 +152,7 @@ def compare_terms(
     """
     table, auto = problem.table, config.terms == "auto"
     x = table.encode({p.name: p.without for p in table} | own.values)
-    whole = replace(own, problem=problem, windows=problem, x=x, refined=(), search=None)
+    whole = replace(own, problem=problem, windows=problem, x=x, search=None)
     parts = parts_of(whole, config, names, _LEAST_TO_CHOOSE if auto else 2)
     search = TermSearch(whole, parts, config.settle_s, config.free_run_s, on_set)
     if search.segments < (count := len(problem.train)):

@@ -31,7 +31,7 @@ from sim2real.identification import verdict
 from sim2real.identification.delays import links
 from sim2real.identification.expected import wider_for, with_expected_errors
 from sim2real.identification.fit import Fit, as_numbers, refine, refit
-from sim2real.identification.predictions import Position, positions, replays, worst_second
+from sim2real.identification.predictions import Position, positions, replays, ringing, worst_second
 from sim2real.identification.problem import Problem, few_of
 from sim2real.identification.residuals import Linearised
 from sim2real.identification.segments import Span, extents
@@ -78,6 +78,12 @@ _TILT, _TURNS = "tilt", (-1.6, -0.8, -0.3, 0.3, 0.8, 1.6, 3.1)
 _UNEXPLAINED = 50.0
 """Ratio of residuals to noise above which a fit is not accepted: real motors leave 5 to 32 times their noise. A base at
 40 degrees left 120 times, and a belt that gives way 57 times, with wrong estimates in narrow intervals."""
+_RINGS = 1 / 3
+"""Share of the residuals that a resonance explains, above which a transmission gives way."""
+_GIVES_WAY = (
+    "a belt, a gear or a mount gives way; the delay includes its lag, so these are no estimates. Measure at the motor, "
+    "or make it stiffer"
+)
 _CAUSES = (
     "look for a gear or a unit of the command, the direction of gravity, a transmission that gives way, an encoder's "
     "zero, or commands that are logged more seldom than they act"
@@ -359,8 +365,12 @@ def lack(document: Identification, fits: Fits) -> Lack:
                 f"with gravity turned by {how} the squared residuals are {share:.0%} smaller: is the base at an angle? "
                 f"turn the gravity of the model, or identify the angle: {flags}",
             )
-        if unexplained := ratio > _UNEXPLAINED:
+        share, hz = ringing(document.samples, position.column)
+        if share > _RINGS:
+            reasons.insert(0, f"{position.name} rings at {hz:.2g} Hz, beyond what the model explains: {_GIVES_WAY}")
+        elif ratio > _UNEXPLAINED:
             reasons[-1] += f"; parameters that explain so little are no estimates: {_CAUSES}"
+        unexplained = share > _RINGS or ratio > _UNEXPLAINED
     if (run := farthest_run(document, measured)) is not None:
         position, error, share = run
         size = "diverges"
