@@ -65,16 +65,12 @@ class Refined:
 
     Attributes:
         x: Shape ``(P,)``: the best point.
-        before: Loss of the best start.
-        steps: Evaluations, of all starts.
         left: Length of the next Gauss-Newton step [standard errors], of the parameter that it moves most.
         converged: Whether the loss has a minimum there: the next step is short, or no point around is better.
     """
 
     x: np.ndarray
     loss: float
-    before: float
-    steps: int
     left: float
     converged: bool
 
@@ -265,7 +261,7 @@ def refine(
             ends += [(x, loss)] if loss < _NEARLY * rough[0][1] and apart > _APART else []
     x, loss = min((descent.down(x, first_gain) for x, _ in ends), key=lambda end: end[1])
     if coarse or not settle:
-        return Refined(x, loss, float(np.nanmin(first)), descent.steps, np.nan, False)
+        return Refined(x, loss, np.nan, False)
     # Descend from the best end to the minimum.
     x, loss = descent.down(x, fine)
     # Test the end; if it is no minimum, continue from a better point nearby.
@@ -278,7 +274,7 @@ def refine(
             break
         x, loss = descent.down(better, fine)
         left = remaining(problem, x, part)
-    return Refined(x, loss, float(np.nanmin(first)), descent.steps, left, converged)
+    return Refined(x, loss, left, converged)
 
 
 def remaining(problem: Problem, x: np.ndarray, part: Part | None = None) -> float:
@@ -332,18 +328,13 @@ def _pull(table: ParameterTable, part: Part) -> np.ndarray:
 
 
 class _Descent:
-    """Descends on one part of a problem.
-
-    Attributes:
-        steps: Evaluations so far.
-    """
+    """Descends on one part of a problem."""
 
     def __init__(self, problem: Problem, part: Part, on_step: OnStep | None, slopes: int | None = None) -> None:
         self._problem, self._part, self._on_step, self._slopes = problem, part, on_step, slopes
         self._best: tuple[float, np.ndarray] = (np.inf, np.zeros(0))
         self._nominal, self._weight = problem.table.nominal(), _pull(problem.table, part)
         self._deviation = 1.0
-        self.steps = 0
 
     def loss(self, x: np.ndarray) -> float:
         """Return the loss at a point, where initial states are linearised there."""
@@ -452,7 +443,6 @@ class _Descent:
         return y
 
     def _report(self, loss: float, x: np.ndarray) -> None:
-        self.steps += 1
         if loss < self._best[0]:
             self._best = (loss, x.copy())
         if self._on_step and np.isfinite(self._best[0]):
