@@ -50,6 +50,8 @@ _TRIES = 3
 _DAMPING, _EASIER, _HARDER, _FAILED = 1e-3, 0.2, 10.0, 5
 """First damping of a round, as a share of the curvature; its factors after a good and after a failed step; steps that
 fail in turn and end a round."""
+_SHORT = 8
+"""Most steps of a round whose Jacobians are limited."""
 _AS_PREDICTED = 0.25
 """Least share of the predicted gain in a step that may end a round by its small gain."""
 OnStep = Callable[[float, np.ndarray], None]
@@ -239,7 +241,7 @@ def refine(
         coarse: Whether the first descents suffice, to compare with a model by percents.
         settle: Whether the end is tested, and points around it are tried if it is no minimum.
         gain: Relative gain of the loss at which the first descents end; default: by the other arguments.
-        slopes: Most Jacobians of a round that are computed, not corrected; default: as many as it needs.
+        slopes: Most Jacobians of a round that are computed, not corrected, and few steps; default: as many as it needs.
     """
     descent = _Descent(problem, part or problem.part(), on_step, slopes)
     starts = problem.table.within(np.asarray(starts, np.float64))
@@ -416,7 +418,8 @@ class _Descent:
         self._deviation = deviation(left[: len(left) - priors].reshape(shape), compared)
         pull, damping, failed, y = (self._deviation * self._weight) ** 2, _DAMPING, 0, x
         cost = float(r @ r) + float(pull @ (y - self._nominal) ** 2)
-        for _ in range(max(1, config.refine_steps)):
+        most = config.refine_steps if self._slopes is None else min(config.refine_steps, _SHORT)
+        for _ in range(max(1, most)):
             G, A = g + pull * (y - self._nominal), H + np.diag(pull)
             A = A + damping * np.diag(np.maximum(np.diag(A), 1e-9 * np.max(np.diag(A) * table.span**2) / table.span**2))
             step = bounded_step(A, G, y, table, free)
