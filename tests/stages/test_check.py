@@ -70,7 +70,7 @@ def test_the_log_is_described(judged):
         (GOOD, None),
         (replace(GOOD, duration_s=8.0), "8.0 s"),
         (replace(GOOD, gaps=2, longest_gap_s=0.5), "2 gaps"),
-        (replace(GOOD, about_torque=("tau is measured",)), "tau"),
+        (replace(GOOD, doubts=("tau is measured",)), "tau"),
         (replace(GOOD, commands=(SignalCoverage("goal", "rad", 1.0, 1.0),)), "no command changes"),
         (replace(GOOD, joints=(replace(JOINT, moving=0.0),)), "th does not move"),
         (replace(GOOD, joints=(replace(JOINT, moving=0.1),)), "th moves 10%"),

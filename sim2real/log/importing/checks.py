@@ -232,6 +232,11 @@ def check_episode(episode: Episode, joints: Sequence[str] = (), by_name: bool = 
     return findings
 
 
+def slow_sides(episode: Episode) -> list[str]:
+    """Return a sentence if commands are logged too seldom for the motion of an episode, or the other way round."""
+    return [finding.text for finding in check_episode(episode) if finding.kind == "rate"]
+
+
 # -- measures of goals and positions
 
 

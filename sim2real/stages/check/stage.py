@@ -23,6 +23,7 @@ from sim2real.identification.model import IdentifiableModel, measured_channels, 
 from sim2real.identification.parameters import ParameterTable
 from sim2real.identification.segments import Span, check_log
 from sim2real.installation import has_jax
+from sim2real.log.importing.checks import slow_sides
 from sim2real.log.importing.names import about_torque
 from sim2real.log.schema import unit_of
 from sim2real.robots.robot import RecordedRobot, Robot, in_world
@@ -81,7 +82,7 @@ class Coverage:
         rate_hz: Median rate [Hz].
         gaps: Number of pauses longer than two and a half periods.
         longest_gap_s: 0 without gaps [s].
-        about_torque: Doubts that a torque is a command.
+        doubts: Sentences on a torque that may be no command, and on commands that are logged too seldom.
     """
 
     name: str
@@ -92,7 +93,7 @@ class Coverage:
     longest_gap_s: float
     joints: tuple[SignalCoverage, ...] = ()
     commands: tuple[SignalCoverage, ...] = ()
-    about_torque: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
 
     def problems(self) -> Iterator[str]:
         """Yield a sentence for each reason why this recording determines little."""
@@ -106,7 +107,7 @@ class Coverage:
                 yield f"{joint.name} moves {joint.moving:.0%} of the time: excite it more, or for longer"
             if not _ONE_SIDED < joint.forward < 1 - _ONE_SIDED:
                 yield f"{joint.name} moves almost only one way: friction and an offset then look alike"
-        yield from self.about_torque
+        yield from self.doubts
         if self.commands and all(c.high == c.low for c in self.commands):
             yield "no command changes: gains and delays of the actuator are not determined"
 
@@ -376,7 +377,7 @@ def coverage(name: str, episode: Episode, model: IdentifiableModel, units: Mappi
     return Coverage(
         *(name, len(begun_s), duration_s, rate_hz, gaps, longest_s, tuple(joints)),
         commands=tuple(_commands(episode, model, fields)),
-        about_torque=tuple(about_torque(episode.metadata.get("mapping") or {})),
+        doubts=(*about_torque(episode.metadata.get("mapping") or {}), *slow_sides(episode)),
     )
 
 

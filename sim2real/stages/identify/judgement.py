@@ -47,7 +47,7 @@ from sim2real.identification.uncertainty import (
 from sim2real.identification.uncertainty import determined as what_is_determined
 from sim2real.identification.uncertainty import widening as posterior_widening
 from sim2real.identification.verdict import ACCEPTED, CHANGE, NO_DELAY, RECORD, Lack, scores, state_of
-from sim2real.log.importing.checks import check_episode
+from sim2real.log.importing.checks import slow_sides
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.identify.fitting import Fits, determined, has_parts, widened, without_parts
 from sim2real.stages.identify.inputs import Inputs, configured, with_load, with_terms
@@ -523,9 +523,8 @@ def _fault(worst: WorstSecond | None, document: Identification) -> tuple[str, bo
 def _slow_commands(inputs: Inputs) -> str:
     """Return a sentence on a fitted log whose commands are logged too seldom for its motion; "": there is none."""
     for log in inputs.logs[: inputs.fitted]:
-        for finding in check_episode(log.episode):
-            if finding.kind == "rate":
-                return f"{log.path.name}: {finding.text}"
+        for sentence in slow_sides(log.episode):
+            return f"{log.path.name}: {sentence}"
     return ""
 
 
