@@ -149,7 +149,8 @@ def test_commands_of_several_joints_have_their_names():
     swings = np.sin(t)[:, None] * np.ones(len(names))
     outputs = {model.sensor: {f: swings for c in model.channels for f, _ in c.fields}}
     outputs[node] = dict.fromkeys(pytree.leaves(message), swings)
-    episode = SimpleNamespace(steps={model.sensor: SimpleNamespace(begun_s=t)}, outputs=outputs, metadata={})
+    steps = dict.fromkeys((model.sensor, node), SimpleNamespace(begun_s=t))
+    episode = SimpleNamespace(steps=steps, outputs=outputs, metadata={}, units={})
     commands = coverage("a", episode, model, {}).commands
     assert [c.name.rpartition(" of ")[2] for c in commands[: len(names)]] == names
 
