@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import numpy as np
@@ -295,8 +296,8 @@ def ringing(samples: Mapping[str, np.ndarray], column: str) -> tuple[float, floa
     acceleration, best = np.gradient(speed, step_s, axis=1), (0.0, 0.0)
     for hz in np.geomspace(_SLOWEST_HZ, max(min(0.35 / step_s, 60.0), _SLOWEST_HZ), 25):
         w = 2.0 * np.pi * float(hz)
-        b, a, _ = cont2discrete(([1.0], [1.0, 2.0 * _DAMPED * w, w * w]), step_s, "foh")
-        beside = lfilter(b.ravel(), a, -acceleration, axis=1)
+        discrete: Any = cont2discrete(([1.0], [1.0, 2.0 * _DAMPED * w, w * w]), step_s, "foh")
+        beside = lfilter(discrete[0].ravel(), discrete[1], -acceleration, axis=1)
         free = np.exp(-_DAMPED * w * grid)
         own = np.stack([grid**0, grid, free * np.cos(w * grid), free * np.sin(w * grid)], axis=1)
         basis = np.linalg.qr(own)[0]

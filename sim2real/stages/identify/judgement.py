@@ -498,13 +498,13 @@ def _judged(
         exceeded=above[:_MOST] + [f"{len(above) - _MOST} more errors are above"] * (len(above) > _MOST),
         lacks=lacks,
     )
-    status, flags, why = judged.status, judged.next, judged.reasons
+    status, flags, why = judged.status, judged.next, list(judged.reasons)
     # No model explains a motion between commands that the log lacks.
     if status == CHANGE and (slow := _slow_commands(inputs)):
-        status, flags, why = RECORD, "", (slow, *why)
+        status, flags, why = RECORD, "", [slow, *why]
     if status == CHANGE and not (flags or lacks.unexplained) and _offers_more(inputs, fit):
         flags = "--terms auto"
-    reasons = tuple(dict.fromkeys([*why, *([fault] if fault else [])]))
+    reasons = tuple(dict.fromkeys([*why, fault] if fault else why))
     parameters = document.parameters if status == ACCEPTED else tuple(map(_doubted, document.parameters))
     judgement = Judgement(status, reasons, flags)
     return replace(document, verdict=judgement, parameters=parameters, held_out=tuple(rows), worst=worst)
