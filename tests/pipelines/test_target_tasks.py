@@ -37,8 +37,10 @@ def joints_at(arm, point, begin):
     low, high = (np.array(end) for end in (arm.robot.drive.servos.low, arm.robot.drive.servos.high))
     q, small = np.array(begin, float), 1e-6 * np.eye(len(begin))
     for _ in range(60):
-        off = point - arm.tip_of(q)
-        slopes = np.stack([(arm.tip_of(q + d) - arm.tip_of(q)) / 1e-6 for d in small], axis=1)
+        here = arm.tip_of(q)
+        off, slopes = point - here, (arm.tip_of(q + small) - here).T / 1e-6
+        if np.abs(off).max() < 1e-9:
+            break
         step = slopes.T @ np.linalg.solve(slopes @ slopes.T + 1e-6 * np.eye(3), off)
         q = np.clip(q + np.clip(step, -0.2, 0.2), low, high)
     return q, float(np.linalg.norm(point - arm.tip_of(q)))
