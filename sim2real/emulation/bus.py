@@ -27,14 +27,10 @@ class BusEmulation(Emulation):
         baud_rate: Bits per second; a byte takes 10 bits.
         sensing_jitter_s: Half-width of the uniform variation of the sensing latency [s]; at most the latency.
         return_delay_us: The servos' Return Delay Time at power-up [us].
-        encoder_counts: Resolution of the encoder [counts per revolution].
         plant_step_s: Period of the grid on which the plant is stepped and commands take effect [s]; at most 1 ms.
-        overload_after_s: Time at which the servos report an overload and switch their torque off [s]; None: never. It
-            counts from the emulator's start.
         wild: Probability that a read returns a position out of the motors' reach, with a correct checksum.
         frozen_after_s: Time from which reads return the position of that time, and no velocity [s]; None: never.
         unplugged_after_s: Time at which the port goes away, as with a pulled USB plug [s]; None: never.
-        ill_after_s: Time from which answers are late or wild [s].
     """
 
     serve: ClassVar[str] = "sim2real.emulation.process:serve_bus"
@@ -44,13 +40,10 @@ class BusEmulation(Emulation):
     baud_rate: int = 1_000_000
     sensing_jitter_s: float = 0.0
     return_delay_us: int = 500
-    encoder_counts: int = 4096
     plant_step_s: float = 0.0005
-    overload_after_s: float | None = None
     wild: float = 0.0
     frozen_after_s: float | None = None
     unplugged_after_s: float | None = None
-    ill_after_s: float = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -61,7 +54,6 @@ class BusEmulation(Emulation):
                 "return_delay_us": (0, 508),
                 "wild": (0.0, 1.0),
                 "plant_step_s": (1e-5, 1e-3),
-                "encoder_counts": (2, 1 << 24),
             }
         )
 
@@ -100,7 +92,6 @@ class Firmware(Protocol):
     def refresh(self, position_rad: float, velocity_rad_s: float, load: float, tick_ms: int) -> None: ...
     def watchdog_deadline_ns(self) -> int | None: ...
     def trip_watchdog(self) -> None: ...
-    def overload(self) -> None: ...
 
 
 class PacketParser(Protocol):
@@ -158,11 +149,7 @@ class PlannedBus(PlannedRobot[B]):
         self._frozen: dict[int, tuple[float, float, float]] = {}
         self._events: list[tuple[int, int, Callable[..., None], tuple[Any, ...]]] = []
         self._sequence = 0
-        if self.faulty_ns is not None:
-            self.begin_faults(start_ns)
-        if config.overload_after_s is not None:
-            overload_ns = start_ns + round(config.overload_after_s * 1e9)
-            self._at(overload_ns, self._overload, overload_ns)
+        self.begin_faults(start_ns)
 
     @property
     def baud_rate(self) -> int:
@@ -226,10 +213,6 @@ class PlannedBus(PlannedRobot[B]):
         """Return whether a fault happens; draws no random number if its probability is 0."""
         return probability > 0.0 and self.random.random() < probability
 
-    def ill(self, probability: float, t_ns: int) -> bool:
-        """Return whether the answer to an instruction at a time [ns] is late, or wild, with this probability."""
-        return self.has(self.config.ill_after_s, t_ns) and self.happens(probability)
-
     def configure(self, servo: Firmware) -> None:
         """Pass a motor's controller settings to the plant if they have changed."""
         controller = servo.controller()
@@ -268,7 +251,7 @@ class PlannedBus(PlannedRobot[B]):
         begin_ns = max(request.t_ns, self._wire_free_ns) + round(return_delay_s * 1e9)
         self._wire_free_ns = begin_ns + round(len(answer) * self._byte_ns)
         # A late answer delays the later ones, as in a USB adapter.
-        late_ns = round(self.config.late_s * 1e9) if self.ill(self.config.late, request.t_ns) else 0
+        late_ns = round(self.config.late_s * 1e9) if self.happens(self.config.late) else 0
         self._delivered_ns = max(self._delivered_ns, self._wire_free_ns + late_ns)
         self._at(self._delivered_ns, self._deliver, self._delivered_ns, servo_id, answer, request, sample)
 
@@ -298,11 +281,6 @@ class PlannedBus(PlannedRobot[B]):
         self.truth.write(Kind.WATCHDOG, servo.servo_id, 0, t_ns, t_ns, 0)
         if servo.watchdog_stops:
             self._stop_motor(servo, t_ns, servo.command()[0])
-
-    def _overload(self, t_ns: int) -> None:
-        for servo in self._firmware.values():
-            servo.overload()
-            self._stop_motor(servo, t_ns, OperatingMode.OFF)
 
     def _stop_motor(self, servo: Firmware, t_ns: int, mode: int) -> None:
         """Stop the motor by its own firmware: at once, dropping commands that have not taken effect yet."""

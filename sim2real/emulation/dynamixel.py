@@ -14,7 +14,6 @@ from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.dynamixel import ALERT_BIT, StatusError
 
 _MOVING_THRESHOLD_COUNT: Final = 10
-_OVERLOAD_BIT: Final = 5
 
 
 class EmulatedServo(ServoFirmware):
@@ -34,10 +33,9 @@ class EmulatedServo(ServoFirmware):
         servo_id: int,
         model_number: int = 1060,
         return_delay_us: int = 500,
-        encoder_counts: int = 4096,
         watchdog_stops: bool | None = None,
     ) -> None:
-        super().__init__(servo_id, model_number, return_delay_us, encoder_counts)
+        super().__init__(servo_id, model_number, return_delay_us)
         self.watchdog_stops = bool(reg.model(model_number).stops_alone) if watchdog_stops is None else watchdog_stops
 
     @property
@@ -82,11 +80,6 @@ class EmulatedServo(ServoFirmware):
         if self.watchdog_stops:
             self.switched_on()
         self.put(reg.BUS_WATCHDOG, -1)
-
-    def overload(self) -> None:
-        """Shut down as after an overload: torque off, and an error bit set until reboot."""
-        self.put(reg.HARDWARE_ERROR_STATUS, 1 << _OVERLOAD_BIT)
-        super().overload()
 
     def switched_on(self) -> None:
         """Set the goals to rest."""
@@ -137,8 +130,7 @@ class EmulatedBus(ServoBus[EmulatedServo, "EmulatorConfig"]):
     wild_counts = (1 << 24, 1 << 31)
 
     def make_servo(self, servo_id: int, config: EmulatorConfig) -> EmulatedServo:
-        settings = config.model_number, config.return_delay_us, config.encoder_counts, config.watchdog_stops
-        return EmulatedServo(servo_id, *settings)
+        return EmulatedServo(servo_id, config.model_number, config.return_delay_us, config.watchdog_stops)
 
     def execute(self, request: Request) -> None:
         if request.packet.code != Instruction.STATUS:

@@ -26,7 +26,6 @@ class StsServo(ServoFirmware):
 
     Args:
         goal_wakes: Whether writing a goal switches the torque on.
-        alarms: The alarms that `overload` sets; bits of the error byte.
     """
 
     family = reg.FAMILY
@@ -39,13 +38,10 @@ class StsServo(ServoFirmware):
         servo_id: int,
         model_number: int = 777,
         return_delay_us: int = 500,
-        encoder_counts: int = reg.COUNTS_PER_REVOLUTION,
         goal_wakes: bool = True,
-        alarms: int = 1 << 5,
     ) -> None:
-        super().__init__(servo_id, model_number, return_delay_us, encoder_counts)
+        super().__init__(servo_id, model_number, return_delay_us)
         self._goal_wakes = goal_wakes
-        self._faults = alarms
         self._saved = bytes(self._memory)
 
     @property
@@ -94,10 +90,6 @@ class StsServo(ServoFirmware):
         super().reboot()
         self.put(reg.TORQUE_LIMIT, self.get(reg.MAX_TORQUE))
 
-    def overload(self) -> None:
-        """Report the alarms from now on; the motor is off as long as one of them is among the unloading conditions."""
-        self.put(reg.STATUS, self._faults)
-
 
 class StsBus(ServoBus[StsServo, "StsEmulation"]):
     """Emulated STS3215 servos on a bus, driving a plant; see `ServoBus`.
@@ -111,7 +103,7 @@ class StsBus(ServoBus[StsServo, "StsEmulation"]):
 
     def make_servo(self, servo_id: int, config: StsEmulation) -> StsServo:
         c = config
-        servo = StsServo(servo_id, c.model_number, c.return_delay_us, c.encoder_counts, c.goal_wakes, c.alarms)
+        servo = StsServo(servo_id, c.model_number, c.return_delay_us, c.goal_wakes)
         servo.put(reg.HOMING_OFFSET, c.homing_offset)
         return servo
 
@@ -131,7 +123,6 @@ class StsEmulation(BusEmulation):
     """Settings of emulated STS3215 servos on their bus; see `Emulation` for the others.
 
     Args:
-        alarms: The alarms that they report from `overload_after_s` on; bits of the error byte.
         wrong_id: Probability that an answer has the id of another servo.
         cut: Probability that an answer ends after its fourth byte.
         goal_wakes: Whether writing a goal switches the torque on, the worse case for a driver.
@@ -141,7 +132,6 @@ class StsEmulation(BusEmulation):
     bus_type = StsBus
 
     model_number: int = 777
-    alarms: int = 32
     wrong_id: float = 0.0
     cut: float = 0.0
     goal_wakes: bool = True
@@ -149,4 +139,4 @@ class StsEmulation(BusEmulation):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.require({"wrong_id": (0, 1), "cut": (0, 1), "alarms": (1, 127), "homing_offset": (-2047, 2047)})
+        self.require({"wrong_id": (0, 1), "cut": (0, 1), "homing_offset": (-2047, 2047)})

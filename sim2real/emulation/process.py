@@ -224,22 +224,16 @@ class _Pty:
 
 
 class StopFlag:
-    """A flag that SIGTERM and SIGINT set, and the time of SIGUSR1, from which times of faults count."""
+    """A flag that SIGTERM and SIGINT set."""
 
     def __init__(self) -> None:
         self.is_set = False
-        self.faulty_ns: int | None = None
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._set)
-        signal.signal(signal.SIGUSR1, self._begin_faults)
 
     def _set(self, number: int, frame: FrameType | None) -> None:
         del number, frame
         self.is_set = True
-
-    def _begin_faults(self, number: int, frame: FrameType | None) -> None:
-        del number, frame
-        self.faulty_ns = time.monotonic_ns()
 
 
 @dataclass(frozen=True)
@@ -310,9 +304,6 @@ def _run(
         inputs = [*connection.inputs, *parent_fds]
         ready = select.select(inputs, [], [], max(0, wake_ns - now_ns) * 1e-9)[0]
         now_ns = time.monotonic_ns()
-        if stop.faulty_ns is not None:
-            robot.begin_faults(stop.faulty_ns)
-            stop.faulty_ns = None
         # Pass on what was sent, then compute all events up to now.
         connection.exchange(robot, now_ns, ready)
         if any(fd in ready and not os.read(fd, 1024) for fd in parent_fds):

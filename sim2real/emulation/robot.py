@@ -13,7 +13,7 @@ from sim2real.errors import UsageError
 
 @dataclass(frozen=True)
 class Emulation:
-    """Settings of an emulated robot; times of faults count from its start, or from a signal.
+    """Settings of an emulated robot; times of faults count from its start.
 
     Args:
         sensing_latency_s: Age of a measurement when it is asked for, or when a state is sent [s].
@@ -28,7 +28,6 @@ class Emulation:
         lets_go_after_s: Time from which the motor `lets_go` has no torque, though it reports torque on, as after
             a gear broke [s]; None: never.
         lets_go: That motor: a servo's id, or its place in the messages.
-        on_signal: Whether these times count from SIGUSR1 to the process.
         seed: Seed of jitter, noise and chances.
     """
 
@@ -46,7 +45,6 @@ class Emulation:
     silent_after_s: float | None = None
     lets_go_after_s: float | None = None
     lets_go: int = 1
-    on_signal: bool = False
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -93,12 +91,12 @@ class PlannedRobot(ABC, Generic[C]):
 
     Attributes:
         config: The settings; they may change while it runs.
-        faulty_ns: Time from which the times of faults count [ns]; None: the signal has not come.
+        faulty_ns: Time from which the times of faults count [ns].
     """
 
     def __init__(self, config: C, truth: TruthLog, start_ns: int) -> None:
         self.config, self.truth, self.start_ns = config, truth, start_ns
-        self.faulty_ns = None if config.on_signal else start_ns
+        self.faulty_ns = start_ns
 
     @abstractmethod
     def next_due_ns(self) -> int | None:
@@ -114,7 +112,7 @@ class PlannedRobot(ABC, Generic[C]):
 
     def has(self, after_s: float | None, t_ns: int) -> bool:
         """Return whether a fault that begins ``after_s`` [s] has begun at a time; None: it never does."""
-        return after_s is not None and self.faulty_ns is not None and t_ns - self.faulty_ns >= 1e9 * after_s
+        return after_s is not None and t_ns - self.faulty_ns >= 1e9 * after_s
 
     def is_silent(self, t_ns: int) -> bool:
         """Return whether nothing is received or sent at a time."""

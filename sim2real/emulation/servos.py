@@ -27,7 +27,6 @@ class ServoFirmware:
 
     Args:
         return_delay_us: Return Delay Time at power-up, rounded to the register's unit of 2 us [us].
-        encoder_counts: Resolution of the encoder [counts per revolution].
 
     Attributes:
         heard_ns: Time of the last instruction that it received.
@@ -43,11 +42,8 @@ class ServoFirmware:
     atomic: ClassVar[bool] = False
     watchdog_stops: bool = False
 
-    def __init__(
-        self, servo_id: int, model_number: int, return_delay_us: int = 500, encoder_counts: int = 4096
-    ) -> None:
+    def __init__(self, servo_id: int, model_number: int, return_delay_us: int = 500) -> None:
         self.servo_id, self.heard_ns = servo_id, 0
-        self._encoder_counts = encoder_counts
         self._memory = bytearray(self.family.size)
         for register in self.family.registers.values():
             self.put(register, register.default)
@@ -151,11 +147,9 @@ class ServoFirmware:
             load: Fraction of the largest load, in [-1, 1].
             tick_ms: Time since power-up [ms].
         """
-        # Round the angle to the encoder's resolution, then to counts of the register.
         del tick_ms
-        family, step_rad = self.family, 2.0 * math.pi / self._encoder_counts
-        count = family.position.count(round(position_rad / step_rad) * step_rad)
-        self.put(family.position, count + self.offset)
+        family = self.family
+        self.put(family.position, family.position.count(position_rad) + self.offset)
         self.put(family.velocity, family.velocity.count(velocity_rad_s))
         self.put(family.load, family.load.count(max(-1.0, min(1.0, load))))
 
@@ -168,10 +162,6 @@ class ServoFirmware:
 
     def trip_watchdog(self) -> None:
         """Trip the watchdog."""
-
-    def overload(self) -> None:
-        """Shut down as after an overload: torque off, and an error reported from now on."""
-        self.put(self.family.torque, 0)
 
     # Where families differ
 
@@ -272,7 +262,7 @@ class ServoBus(PlannedBus[E], Generic[S, E]):
         """Let a servo answer a read."""
         address, length = self.form.word(request.packet.parameters, 0), self._second_word(request)
         sample = self.measure(servo, request.t_ns)
-        if self.ill(self.config.wild, request.t_ns):
+        if self.happens(self.config.wild):
             servo.put(self.family.position, self.random.randrange(*self.wild_counts))
         error, data = servo.read(address, length)
         if servo.answers_reads:

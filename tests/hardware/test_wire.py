@@ -308,14 +308,3 @@ def test_late_answers_come_in_order(make_bench):
         bench.send((700 + i) * MS, build(1, Instruction.PING))
     bench.run_until(900 * MS)
     assert np.all(np.diff([t_ns for t_ns, _ in bench.sent]) >= 0)
-
-
-def test_faults_wait_for_their_signal(make_bench):
-    bench = make_bench("Ramp", EmulatorConfig(wild=1.0, unplugged_after_s=0.2, on_signal=True))
-    counts = [read_state(bench, t * MS)[1] for t in (60, 120, 180)]
-    assert counts == sorted({*counts}), "not ill yet"
-    assert not bench.bus.unplugged(10_000 * MS)
-    bench.bus.begin_faults(200 * MS)
-    assert abs(read_state(bench, 220 * MS)[1] * reg.RAD_PER_COUNT) > 10_000.0
-    assert not bench.bus.unplugged(399 * MS)
-    assert bench.bus.unplugged(400 * MS)

@@ -15,7 +15,7 @@ from sim2real.hardware.device import OperatingMode
 from .odrive import CLOSED_LOOP, IDLE, STATE, TURN, WATCHDOG, SpeedLoop, framed, unframed
 
 _ERROR, _TIMEOUT, _INPUT = "axis0.error", "axis0.config.watchdog_timeout", "axis0.controller.input_vel"
-_WATCHDOG_EXPIRED, _MOTOR_FAILED = 0x800, 0x40
+_WATCHDOG_EXPIRED = 0x800
 
 
 class Lines:
@@ -77,10 +77,6 @@ class Axis:
         """Disarm the motor."""
         self.fail(_WATCHDOG_EXPIRED)
 
-    def overload(self) -> None:
-        """Disarm the motor."""
-        self.fail(_MOTOR_FAILED)
-
     def fail(self, error: int) -> None:
         """Disarm the motor, with an error."""
         self.properties[_ERROR] = int(self.properties[_ERROR]) | error
@@ -131,7 +127,7 @@ class Board(PlannedBus["ODriveEmulation"]):
             axis.properties[_ERROR] = 0
         elif word == "f":
             sample = self.measure(axis, request.t_ns)
-            turns = axis.turns + 1000.0 * self.ill(self.config.wild, request.t_ns)
+            turns = axis.turns + 1000.0 * self.happens(self.config.wild)
             answer = f"{turns:f} {axis.turns_per_s:f}"
         elif word == "r":
             answer = f"{axis.properties[rest[0]]:f}" if rest[0] in axis.properties else "invalid property"
