@@ -18,6 +18,7 @@ import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import Final, Protocol
 
 from sim2real.errors import HardwareLost, SafetyStop
@@ -160,9 +161,9 @@ def main(link_fd: str, silence_s: str, place: str, *arguments: str) -> None:
         import ctypes
 
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGCONT)
-    link = int(link_fd)
-    tell = lambda text: _write(2, f"{text}\n".encode())  # noqa: E731
-    Guard(motors, float(silence_s), lambda message: _write(link, message), tell).watch(link)
+    link, stderr = int(link_fd), 2
+    say, tell = partial(_write, link), lambda text: _write(stderr, f"{text}\n".encode())
+    Guard(motors, float(silence_s), say, tell).watch(link)
     motors.close()
 
 
