@@ -9,7 +9,7 @@ import pytest
 from test_doctor_contract import network
 
 from sim2real import cli
-from sim2real.doctor import plant
+from sim2real.doctor import before, plant
 from sim2real.doctor.contract import Contract, Term, contract_facts, contract_toml
 from sim2real.doctor.log import read_deployment
 from sim2real.doctor.plant import Drives, driven_joints, solve_plant
@@ -26,9 +26,10 @@ CONTRACT = Contract(
 
 
 @pytest.fixture(autouse=True)
-def few_windows(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Replay a quarter of the windows, which takes a quarter of the time."""
+def brief(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Replay a quarter of the windows, and let a policy stand for a third of the time."""
     monkeypatch.setattr(plant, "_WINDOWS", 10)
+    monkeypatch.setattr(before, "_SECONDS", 1.3)
 
 
 def recorded(folder: Path, kp: float = 1.0, limit: float = 1e6, delay_s: float = 0.01, rate: float = 50.0) -> Path:

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_robot import VALUES, world_params
+from mujoco import mjx
 
 from sim2real.artifacts.identification import Noise
 from sim2real.errors import UsageError
@@ -16,6 +16,7 @@ from sim2real.robots.agent import AgentParams
 from sim2real.robots.loop import DelayParams
 from sim2real.robots.messages import Decision, JointReading
 from sim2real.robots.nodes import SimActuator, SimSensor
+from sim2real.robots.servo.world import ServoState
 
 
 def heard(sender, message):
@@ -35,8 +36,8 @@ def test_the_world_is_half_a_step_behind_its_commands(pair):
 
 def test_a_push_gives_the_joints_other_velocities_and_moves_nothing(pair):
     world = pair.model.make_world()
-    params = world_params(pair, VALUES, [0.1, 0.2], [0.5, 0.0], [0.1])
-    state = world.init_state(jax.random.key(0), GraphState(params={"world": params}))
+    data = mjx.make_data(pair.model.model).replace(qvel=jnp.array([0.5, 0.0]))
+    state = ServoState(data, jnp.zeros(2), {}, ((0, 1), (0, 1)))
     pushed = world.with_velocity(state, jnp.array([1.5, -1.0]))
     np.testing.assert_array_equal(world.velocity(state), [0.5, 0.0])
     np.testing.assert_array_equal(world.velocity(pushed), [1.5, -1.0])
