@@ -47,7 +47,7 @@ def one(seconds: float, case: tuple[str, int, tuple[str, ...]]) -> tuple[list[st
         begin = time.perf_counter()
         joints = tuple(driven_joints(files["mjcf"]))
         policy = read_policy(files["policy"], files["contract"], joints)
-        log = read_deployment(files["log"], policy.contract.joints, len(policy.contract.joints), joints)
+        log = read_deployment(files["log"], policy.contract.joints, joints)
         found = diagnose(policy, log, Drives(files["mjcf"], policy.contract), None, joints)
         return found.faults, time.perf_counter() - begin
 

@@ -15,7 +15,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from sim2real.doctor.contract import Contract, Policy, Term, contract_facts, contract_toml
+from sim2real.doctor.contract import Contract, Policy, Term, contract_toml
 
 ROOT = Path(__file__).resolve().parents[2]
 STEP_S = 0.002
@@ -108,8 +108,7 @@ def _reacher(
     )  # fmt: skip
     samples = _samples(contract, swing, rng)
     lagged = [i for i, (term, lag) in enumerate(contract.layout) if contract.observation[term].kind == "joint_pos"]
-    starts = np.cumsum([0, *(contract.size_of(contract.observation[t]) for t, _ in contract.layout)])
-    block = lambda k, lag: samples[:, _slice(contract, starts, k, lag)]  # noqa: E731
+    block = lambda k, lag: samples[:, contract.block(k, lag)]  # noqa: E731
     q, old, dq = block(0, 0), block(0, len(lagged) - 1), block(1, 0) / contract.observation[1].scale
     last, command = block(2, 0), block(3, 0)
     mixing = np.eye(count) + 0.05 * rng.normal(size=(count, count))
@@ -136,14 +135,9 @@ def replace_contract(contract: Contract, **changes: Any) -> Contract:
     return msgspec.structs.replace(contract, **changes)
 
 
-def _slice(contract: Contract, starts: np.ndarray, term: int, lag: int) -> slice:
-    block = contract.layout.index((term, lag))
-    return slice(starts[block], starts[block + 1])
-
-
 def _samples(contract: Contract, swing: float, rng: np.random.Generator) -> np.ndarray:
     """Return observations of smooth random motions ``(N, O)``."""
-    n, count, history = 6000, len(contract.joints), contract.observation[0].history
+    n, count = 6000, len(contract.joints)
     command = swing * rng.uniform(-1.2, 1.2, (n, count))
     q, dq = command + 0.3 * rng.normal(size=(n, count)), 2.0 * rng.normal(size=(n, count))
     parts = []
@@ -154,7 +148,6 @@ def _samples(contract: Contract, swing: float, rng: np.random.Generator) -> np.n
                  "last_action": command / contract.action_scale + 0.5 * rng.normal(size=q.shape),
                  "command": command}[kind]  # fmt: skip
         parts.append(value * contract.observation[term].scale)
-    del history
     return np.concatenate(parts, axis=1)
 
 
@@ -479,7 +472,7 @@ def write_case(robot: Robot, signals: dict[str, np.ndarray], folder: Path, rng: 
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "robot.xml").write_text(robot.xml)
     (folder / "policy.onnx").write_bytes(robot.network)
-    (folder / "contract.toml").write_text(contract_toml(contract_facts(robot.contract), {}))
+    (folder / "contract.toml").write_text(contract_toml(robot.contract))
     kept = ["t", "command", "target"]
     logs = rng.random(2).tolist()
     kept += ["observation"] * (logs[0] < 0.5) + ["action"] * (logs[0] < 0.5 or logs[1] < 0.5)

@@ -41,51 +41,45 @@ def doctor(command: str, arguments: list[str]) -> None:
         "doctor --policy policy.onnx --mjcf robot.xml",
     )
     config = flags.parse(DoctorConfig(), arguments, f"sim2real {command}", *examples)
-    data, sentence, wrong = run(config)
-    print(json.dumps(data, indent=2, default=float) if config.json else sentence)
+    data, lines, wrong = _answer(config)
+    print(json.dumps(data, indent=2, default=float) if config.json else "\n".join(lines))
     if wrong:
         sys.exit(ERROR)
 
 
-def run(config: DoctorConfig) -> tuple[dict[str, Any], str, bool]:
-    """Return the diagnosis as data, its text, and whether something is wrong; write the page.
-
-    Raises:
-        UsageError: A file is missing or wrong, or the contract has open questions.
-    """
+def _answer(config: DoctorConfig) -> tuple[dict[str, Any], list[str], bool]:
+    """Return the answer as data and as lines, and whether something is wrong; write the page or the bundle."""
+    from sim2real.doctor.before import examine
     from sim2real.doctor.contract import read_policy, write_bundle
+    from sim2real.doctor.diagnosis import diagnose
+    from sim2real.doctor.log import read_deployment
     from sim2real.doctor.plant import Drives, driven_joints
+    from sim2real.doctor.report import write_diagnosis
 
     if config.policy is None or (config.log is None and config.mjcf is None and config.bundle is None):
         raise UsageError("doctor needs --policy, and --log of the robot or --mjcf of the model, or both")
+    say = note if config.json else wrote
     config.out.mkdir(parents=True, exist_ok=True)
     joints = tuple(driven_joints(config.mjcf)) if config.mjcf else ()
     policy = read_policy(config.policy, config.contract, joints, config.out)
+    wanted = policy.contract.joints
     if config.bundle is not None:
-        (note if config.json else wrote)(str(write_bundle(config.bundle, policy)))
-        if config.log is None and config.mjcf is None:
-            return {"bundle": str(config.bundle)}, f"{config.bundle} is a bundle", False
+        say(str(write_bundle(config.bundle, policy)))
     drives = Drives(config.mjcf, policy.contract) if config.mjcf else None
+    if config.log is None and drives is None:
+        return {"bundle": str(config.bundle)}, [f"{config.bundle} is a bundle"], False
     if config.log is None:
-        from sim2real.doctor.before import examine
-
         assert drives is not None
         with progress(None, "let the policy act in the model"):
             data = examine(policy, drives)
-        return data, "\n".join([data["sentence"], *(f"- {line}" for line in data["lines"])]), not data["sound"]
-
-    from sim2real.doctor.diagnosis import diagnose
-    from sim2real.doctor.log import read_deployment
-    from sim2real.doctor.report import write_diagnosis
-
-    wanted = policy.contract.joints
-    log = read_deployment(config.log, wanted, len(wanted), joints)
-    sim = None if config.sim is None else read_deployment(config.sim, wanted, len(wanted), joints)
+        return data, [data["sentence"], *(f"- {line}" for line in data["lines"])], not data["sound"]
+    log = read_deployment(config.log, wanted, joints)
+    sim = None if config.sim is None else read_deployment(config.sim, wanted, joints)
     note(f"{len(log.t)} steps of the policy in {log.t[-1] - log.t[0]:.1f} s")
     with progress(None, "look for what is wrong"):
         found = diagnose(policy, log, drives, sim, joints)
-    page = write_diagnosis(config.out, found, log, config.policy.stem)
-    (note if config.json else wrote)(str(page))
+    page = str(write_diagnosis(config.out, found, log, config.policy.stem))
+    say(page)
     lines = [found.sentence, *(f"- {f.question}: {f.text}; {f.share:.0%} of this gap" for f in found.findings),
              *(f"- {question} was not asked: {why}" for question, why in found.skipped.items())]  # fmt: skip
-    return found.to_dict() | {"page": str(page)}, "\n".join(lines), bool(found.findings) or found.unexplained
+    return found.to_dict() | {"page": page}, lines, bool(found.findings) or found.unexplained

@@ -35,69 +35,63 @@ class Run:
 def examine(policy: Policy, drives: Drives) -> dict[str, Any]:
     """Return what may fail: numbers that are none, unmeasured entries, and what the policy stands in the model."""
     c, lines, rng = policy.contract, list[str](), np.random.default_rng(0)
-    numbers = [policy(scale * rng.normal(size=(256, c.size))) for scale in _LARGE]
-    finite = all(np.isfinite(action).all() for action in numbers)
+    finite = all(np.isfinite(policy(scale * rng.normal(size=(256, c.size)))).all() for scale in _LARGE)
     if not finite:
         lines.append("the network gives numbers that are not finite for large observations")
 
     # Entries that no robot measures.
-    unmeasured = {}
-    starts = np.cumsum([0, *(c.size_of(c.observation[t]) for t, _ in c.layout)])
+    unmeasured: dict[str, float] = {}
     usual = 0.3 * rng.normal(size=(256, c.size))
-    for block, (term, _) in enumerate(c.layout):
+    for term, lag in c.layout:
         own = c.observation[term]
         if own.kind in UNMEASURED:
             moved = usual.copy()
-            moved[:, starts[block] : starts[block + 1]] += 0.5
+            moved[:, c.block(term, lag)] += 0.5
             change = float(np.abs(policy(moved) - policy(usual)).mean() / (policy(usual).std() + 1e-9))
             unmeasured[own.term] = max(change, unmeasured.get(own.term, 0.0))
     lines += [f"the action depends on {name}, which a robot's sensors do not give: 0.5 of it changes the actions by "
               f"{change:.0%} of their deviation" for name, change in unmeasured.items() if change > 0.02]  # fmt: skip
 
     # The policy in the model, as trained and with what a robot may have.
-    nominal = _run(policy, drives, Plant(), None)
-    runs = {f"{1e3 * d:.0f} ms": _run(policy, drives, Plant(delay_s=d), None) for d in _DELAYS_S}
-    others = {name: _run(policy, drives, plant, None) for name, plant in _PLANTS.items()}
-    starts_up = [_run(policy, drives, Plant(), np.random.default_rng(seed)).up for seed in range(_STARTS)]
-    standing = lambda run: run.up and run.speed < max(3.0 * nominal.speed, _FAST_RAD_S)  # noqa: E731
-    first = next((name for name, run in runs.items() if not standing(run)), None)
+    nominal = _run(policy, drives, Plant())
+    stands = lambda plant: (run := _run(policy, drives, plant)).up and run.speed < limit  # noqa: E731
+    limit = max(3.0 * nominal.speed, _FAST_RAD_S)
+    delays = {f"{1e3 * delay_s:.0f} ms": stands(Plant(delay_s=delay_s)) for delay_s in _DELAYS_S}
+    plants = {name: stands(plant) for name, plant in _PLANTS.items()}
+    starts = sum(_run(policy, drives, Plant(), np.random.default_rng(seed)).up for seed in range(_STARTS))
     if not nominal.up:
         text = f"in the model itself the policy fails after {nominal.until_s:.2f} s, without a command and a delay"
         lines.insert(0, f"{text}: the contract or the model is not that of the training")
-    elif first is not None:
+    elif not all(delays.values()):
+        first = next(name for name, stood in delays.items() if not stood)
         lines.append(f"it fails from a delay of {first} on: measure the robot's")
-    lines += [f"it fails with {name}" for name, run in others.items() if nominal.up and not standing(run)]
-    if nominal.up and sum(starts_up) < _STARTS:
-        lines.append(
-            f"it stays up from {sum(starts_up)} of {_STARTS} starts within {_POSE_RAD} rad of its default pose"
-        )
+    if nominal.up:
+        lines += [f"it fails with {name}" for name, stood in plants.items() if not stood]
+        if starts < _STARTS:
+            lines.append(f"it stays up from {starts} of {_STARTS} starts within {_POSE_RAD} rad of its default pose")
     if nominal.clipped > 0.05:
         lines.append(f"{nominal.clipped:.0%} of its commands ask for more torque than the model's drives have")
     if nominal.beyond > 0.05:
         lines.append(f"{nominal.beyond:.0%} of its targets are beyond the joints' ranges")
-    sound = finite and nominal.up and not lines
-    sentence = "Nothing speaks against a first test." if sound else f"{lines[0][0].upper()}{lines[0][1:]}."
+    sentence = f"{lines[0][0].upper()}{lines[0][1:]}." if lines else "Nothing speaks against a first test."
     return {
-        "sentence": sentence, "sound": sound, "lines": lines, "finite": finite, "unmeasured": unmeasured,
-        "delays": {name: standing(run) for name, run in runs.items()},
-        "plants": {name: standing(run) for name, run in others.items()},
-        "starts": f"{sum(starts_up)} of {_STARTS}", "stays_up": nominal.up, "clipped": nominal.clipped,
-        "beyond": nominal.beyond,
+        "sentence": sentence, "sound": not lines, "lines": lines, "finite": finite, "unmeasured": unmeasured,
+        "delays": delays, "plants": plants, "starts": f"{starts} of {_STARTS}", "stays_up": nominal.up,
+        "clipped": nominal.clipped, "beyond": nominal.beyond,
     }  # fmt: skip
 
 
-def _run(policy: Policy, drives: Drives, plant: Plant, start: np.random.Generator | None) -> Run:
-    """Let the policy act in the model, with the command 0."""
+def _run(policy: Policy, drives: Drives, plant: Plant, start: np.random.Generator | None = None) -> Run:
+    """Let the policy act in the model, with the command 0; ``start`` draws another start."""
     c, d = policy.contract, drives
     model = d.with_plant(plant, np.full(len(c.joints), 1e6))
     data = mujoco.MjData(model)
     default = c.per_joint("default_joint_pos")
-    data.qpos[d.qpos] = default
-    if start is not None:
-        data.qpos[d.qpos] += start.uniform(-_POSE_RAD, _POSE_RAD, len(default))
+    spread = (0.0, 0.0) if start is None else (_POSE_RAD, _TILT_RAD)
+    draw = start or np.random.default_rng(0)
+    data.qpos[d.qpos] = default + draw.uniform(-spread[0], spread[0], len(default))
     if d.free:
-        turn = np.zeros(3) if start is None else start.uniform(-_TILT_RAD, _TILT_RAD, 3)
-        mujoco.mju_euler2Quat(data.qpos[3:7], turn, "xyz")
+        mujoco.mju_euler2Quat(data.qpos[3:7], draw.uniform(-spread[1], spread[1], 3), "xyz")
         data.qpos[2] = 0.0
         mujoco.mj_kinematics(model, data)
         data.qpos[2] = 0.002 - min(p[2] for _, p in lowest_points(model, data))
@@ -108,8 +102,11 @@ def _run(policy: Policy, drives: Drives, plant: Plant, start: np.random.Generato
     commands: deque[tuple[float, np.ndarray]] = deque([(-1.0, resting)])
     action, next_s, speeds, clipped, beyond = np.zeros(len(c.joints)), 0.0, [], [], []
     data.ctrl[:] = resting
-    ranges, limited = model.jnt_range[_joint_ids(model, c.joints)], model.jnt_limited[_joint_ids(model, c.joints)]
+    ids = [model.joint(j).id for j in c.joints]
+    low, high = model.jnt_range[ids].T
+    bounded = (model.jnt_limited[ids] == 1) & (c.drive == "position")
     size = sum(c.size_of(t) for t in c.observation if t.kind == "command")
+    ended = lambda up, now, kept: Run(up, now, float(np.mean(kept)), float(np.mean(clipped)), float(np.mean(beyond)))  # noqa: E731
     steps = int(_SECONDS / model.opt.timestep)
     for tick in range(steps):
         now = tick * model.opt.timestep
@@ -119,19 +116,18 @@ def _run(policy: Policy, drives: Drives, plant: Plant, start: np.random.Generato
             past.append((data.qpos[d.qpos].copy(), data.qvel[d.dof].copy(), quat.copy(), gyro.copy(), action))
             rows = [past[0]] * (longest + 1 - len(past)) + list(past)
             q, dq, quats, gyros, actions = (np.array(column) for column in zip(*rows, strict=True))
-            times = np.arange(len(rows)) / c.rate_hz
+            times, count = np.arange(len(rows)) / c.rate_hz, len(rows)
             # The newest row's own action does not exist yet: its last action is that of the row before.
-            log = Log(times, times, q, dq, quats, gyros, np.zeros((len(rows), 3)),
-                      np.zeros((len(rows), size)), None, np.roll(actions, -1, 0))  # fmt: skip
+            log = Log(times, times, q, dq, quats, gyros, np.zeros((count, 3)), np.zeros((count, size)), None,
+                      np.roll(actions, -1, 0))  # fmt: skip
             deployed = Deployed(log, policy)
-            action = policy(deployed.observations(Making(), np.array([len(rows) - 1])))[0]
+            action = policy(deployed.observations(Making(), np.array([count - 1])))[0]
             if not np.isfinite(action).all():
                 return Run(False, now, np.inf, 1.0, 1.0)
             target = deployed.targets(Making(), action[None])[0]
             commands.append((now + plant.delay_s, target))
-            torque = target if d.torque_driven else d.kp * (target - q[-1]) - d.kd * dq[-1]
-            clipped.append(np.abs(torque) > d.limit)
-            beyond.append(limited & ((target < ranges[:, 0]) | (target > ranges[:, 1])) & (c.drive == "position"))
+            clipped.append(np.abs(d.torque(target, q[-1], dq[-1])) > d.limit)
+            beyond.append(bounded & ((target < low) | (target > high)))
         while len(commands) > 1 and commands[1][0] <= now:
             commands.popleft()
         data.ctrl[:] = commands[0][1]
@@ -139,9 +135,5 @@ def _run(policy: Policy, drives: Drives, plant: Plant, start: np.random.Generato
         speeds.append(float(np.sqrt(np.mean(data.qvel[d.dof] ** 2))))
         fallen = d.free and (data.qpos[2] < 0.5 * height or 1 - 2 * (data.qpos[4] ** 2 + data.qpos[5] ** 2) < _UPRIGHT)
         if fallen or not np.isfinite(data.qpos).all() or speeds[-1] > 100.0:
-            return Run(False, now, float(np.mean(speeds)), float(np.mean(clipped)), float(np.mean(beyond)))
-    return Run(True, _SECONDS, float(np.mean(speeds[steps // 2 :])), float(np.mean(clipped)), float(np.mean(beyond)))
-
-
-def _joint_ids(model: Any, joints: tuple[str, ...]) -> list[int]:
-    return [model.joint(j).id for j in joints]
+            return ended(False, now, speeds)
+    return ended(True, _SECONDS, speeds[steps // 2 :])

@@ -6,6 +6,7 @@ import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
 import msgspec
@@ -98,7 +99,6 @@ class Contract(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
     mean: tuple[float, ...] = ()
     std: tuple[float, ...] = ()
     clip: float = 1e9
-    source: str = ""
 
     def per_joint(self, name: str) -> np.ndarray:
         """Return one of the settings with a number for each joint, ``(J,)``."""
@@ -128,6 +128,12 @@ class Contract(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
             return [(i, lag) for lag in lags for i, term in terms if lag < term.history]
         return [(i, lag) for i, term in terms for lag in lags if lag < term.history]
 
+    def block(self, term: int, lag: int) -> slice:
+        """Return where the observation has a term of some steps ago."""
+        at = self.layout.index((term, lag))
+        begin = sum(self.size_of(self.observation[t]) for t, _ in self.layout[:at])
+        return slice(begin, begin + self.size_of(self.observation[term]))
+
     @property
     def size(self) -> int:
         """Number of entries of the observation."""
@@ -138,20 +144,30 @@ class Policy:
     """A network with its contract.
 
     Args:
-        network: The bytes of an ONNX file with one input and one output that are vectors.
+        content: The bytes of an ONNX file whose only input and output are vectors; rows are computed together if it
+            has a free batch axis.
     """
 
-    def __init__(self, network: bytes, contract: Contract) -> None:
-        self.content, self.network, self.contract = network, Network(network), contract
-        wanted = self.network.sizes
-        if wanted[0] is not None and wanted[0] != contract.size:
+    def __init__(self, content: bytes, contract: Contract) -> None:
+        self.content, self.contract = content, contract
+        self._session = onnx_session(_batched(content))
+        inputs, output = self._session.get_inputs(), self._session.get_outputs()[0]
+        if len(inputs) != 1:
+            names = ", ".join(i.name for i in inputs)
+            raise UsageError(
+                f"the network has {len(inputs)} inputs: {names}; the doctor reads networks with the observation alone",
+                hint="export the actor without its memory or time step, as a function of the observation",
+            )
+        self._input, self._output = inputs[0].name, output.name
+        takes, gives = (shape[-1] if shape else None for shape in (inputs[0].shape, output.shape))
+        if isinstance(takes, int) and takes != contract.size:
             listed = ", ".join(f"{t.term} {t.history}x{contract.size_of(t)}" for t in contract.observation)
             raise UsageError(
-                f"the network takes {wanted[0]} numbers, the contract's terms are {contract.size}: {listed}",
+                f"the network takes {takes} numbers, the contract's terms are {contract.size}: {listed}",
                 hint="correct [[observation]]: terms, size or history",
             )
-        if wanted[1] is not None and wanted[1] != len(contract.joints):
-            raise UsageError(f"the network gives {wanted[1]} actions, the contract has {len(contract.joints)} joints")
+        if isinstance(gives, int) and gives != len(contract.joints):
+            raise UsageError(f"the network gives {gives} actions, the contract has {len(contract.joints)} joints")
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
         """Return the actions ``(N, A)`` for observations ``(N, O)`` before normalising."""
@@ -160,35 +176,16 @@ class Policy:
     def normalised(self, observations: np.ndarray) -> np.ndarray:
         """Return observations as the network takes them."""
         c = self.contract
-        if not c.mean:
-            return observations
-        return np.clip((observations - np.array(c.mean)) / np.array(c.std), -c.clip, c.clip)
+        return np.clip((observations - np.array(c.mean)) / np.array(c.std), -c.clip, c.clip) if c.mean else observations
 
-
-class Network:
-    """An ONNX file with one vector as input; rows are computed together if it has a free batch axis."""
-
-    def __init__(self, content: bytes) -> None:
-        self._session = onnx_session(_batched(content))
-        inputs = self._session.get_inputs()
-        if len(inputs) != 1:
-            names = ", ".join(i.name for i in inputs)
-            raise UsageError(
-                f"the network has {len(inputs)} inputs: {names}; the doctor reads networks with the observation alone",
-                hint="export the actor without its memory or time step, as a function of the observation",
-            )
-        self._input, self._output = inputs[0].name, self._session.get_outputs()[0].name
-        shapes = inputs[0].shape, self._session.get_outputs()[0].shape
-        self.sizes = tuple(s[-1] if s and isinstance(s[-1], int) else None for s in shapes)
-
-    def __call__(self, x: np.ndarray) -> np.ndarray:
-        """Return the output ``(N, A)``, float64, for ``(N, O)``."""
+    def network(self, x: np.ndarray) -> np.ndarray:
+        """Return the network's output ``(N, A)``, float64, for what it takes ``(N, O)``."""
         rows = np.ascontiguousarray(x, np.float32)
+        run = lambda value: self._session.run([self._output], {self._input: value})[0]  # noqa: E731
         try:
-            return np.asarray(self._session.run([self._output], {self._input: rows})[0], float).reshape(len(rows), -1)
+            return np.asarray(run(rows), float).reshape(len(rows), -1)
         except Exception:  # a network that reshapes to one row
-            each = [self._session.run([self._output], {self._input: row[None]})[0] for row in rows]
-            return np.asarray(each, float).reshape(len(rows), -1)
+            return np.asarray([run(row[None]) for row in rows], float).reshape(len(rows), -1)
 
 
 def _batched(content: bytes) -> bytes:
@@ -215,34 +212,32 @@ def write_bundle(folder: Path, policy: Policy) -> Path:
     from sim2real.policy.contract import ActionTerm, NetworkSpec, ObservationTerm, PolicyContract
 
     c, model = policy.contract, onnx.load_from_string(policy.content)
-    graph = model.graph
-    # The input and output get the bundle's names; constants of the normaliser come before the network.
-    before, after = graph.input[0].name, graph.output[0].name
-    steps = [("observation", "Identity", [])]
-    if c.mean:
-        for name, value in (("mean", c.mean), ("std", c.std), ("low", -c.clip), ("high", c.clip)):
-            graph.initializer.append(numpy_helper.from_array(np.asarray(value, np.float32), f"sim2real_{name}"))
-        steps = [("observation", "Sub", ["sim2real_mean"]), ("sim2real_a", "Div", ["sim2real_std"]),
-                 ("sim2real_b", "Clip", ["sim2real_low", "sim2real_high"])]  # fmt: skip
-    names = [*(source for source, _, _ in steps[1:]), before]
-    nodes = [helper.make_node(kind, [source, *rest], [name])
-             for (source, kind, rest), name in zip(steps, names, strict=True)]  # fmt: skip
-    nodes += [*graph.node, helper.make_node("Identity", [after], ["action"])]
+    graph, size, count = model.graph, policy.contract.size, len(policy.contract.joints)
+    # The input and output get the bundle's names; the normaliser comes before the network.
+    takes, gives = graph.input[0].name, graph.output[0].name
+    constants = {"mean": c.mean or np.zeros(size), "std": c.std or np.ones(size), "low": -c.clip, "high": c.clip}
+    graph.initializer.extend(
+        numpy_helper.from_array(np.asarray(value, np.float32), f"sim2real_{name}") for name, value in constants.items()
+    )
+    nodes = [
+        helper.make_node("Sub", ["observation", "sim2real_mean"], ["sim2real_a"]),
+        helper.make_node("Div", ["sim2real_a", "sim2real_std"], ["sim2real_b"]),
+        helper.make_node("Clip", ["sim2real_b", "sim2real_low", "sim2real_high"], [takes]),
+        *graph.node,
+        helper.make_node("Identity", [gives], ["action"]),
+    ]
     del graph.node[:]
     graph.node.extend(nodes)
-    for value, name, size in ((graph.input[0], "observation", c.size), (graph.output[0], "action", len(c.joints))):
-        value.CopyFrom(helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [1, size]))
-    terms = tuple(ObservationTerm(f"{t.term}", ("1",) * c.size_of(t), t.history) for t in c.observation)
+    for value, name, length in ((graph.input[0], "observation", size), (graph.output[0], "action", count)):
+        value.CopyFrom(helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [1, length]))
+    terms = tuple(ObservationTerm(t.term, ("1",) * c.size_of(t), t.history) for t in c.observation)
     actions = tuple(ActionTerm(joint, "1", -_BOUND, _BOUND) for joint in c.joints)
-    delays = {} if c.delay_s is None else {"round_trip": c.delay_s}
-    about = PolicyContract(terms, actions, c.rate_hz, delays)
-    size, count = c.size, len(actions)
+    about = PolicyContract(terms, actions, c.rate_hz, {} if c.delay_s is None else {"round_trip": c.delay_s})
     weights = {"mean": np.zeros(size), "std": np.ones(size), "low": np.full(count, -_BOUND),
                "high": np.full(count, _BOUND), "log_std": np.zeros(count)}  # fmt: skip
-    spec = NetworkSpec("foreign:onnx")
-    save_bundle(folder, weights, about, spec=spec, graph=model.SerializeToString())
+    save_bundle(folder, weights, about, spec=NetworkSpec("foreign:onnx"), graph=model.SerializeToString())
     inside = msgspec.structs.replace(c, mean=(), std=())
-    (folder / FILE).write_text(contract_toml(contract_facts(inside), {}), encoding="utf-8")
+    (folder / FILE).write_text(contract_toml(inside), encoding="utf-8")
     return folder
 
 
@@ -269,28 +264,28 @@ def read_policy(
     """
     content, facts = _read_export(policy)
     if description is not None:
-        facts = facts | _read_description(description, model_joints)
+        facts |= _read_description(description, model_joints)
     questions = {name: text for name, text in _QUESTIONS.items() if name not in facts}
     for name in ("kp", "kd"):
-        if name in questions and (facts.get("drive") == "torque" or f"{name}_refused" not in facts):
-            del questions[name]  # the model has gains, and a torque needs none
-        elif name in questions:
-            questions[name] = f"{facts[f'{name}_refused']}: {questions[name]}"
-    known = {name: value for name, value in facts.items() if not name.endswith("_refused")}
+        # The model may have gains, and a torque needs none; what an exporter has put there is asked again.
+        why = _no_gain(name, facts[name]) if name in facts else ""
+        if why:
+            del facts[name]
+            if facts.get("drive") != "torque":
+                questions[name] = f"{why}: {_QUESTIONS[name]}"
+        else:
+            questions.pop(name, None)
     if questions:
         path = out / FILE
-        path.write_text(contract_toml(known, questions), encoding="utf-8")
+        path.write_text(contract_toml(facts, questions), encoding="utf-8")
         raise UsageError(
             f"{policy} does not say everything; {path} has {len(questions)} open questions:\n"
             + "\n".join(f"  {name}: {text}" for name, text in questions.items()),
             hint=f"answer them in the file, and repeat the command with --contract {path}",
         )
-    return Policy(content, _converted(known, str(description or policy)))
-
-
-def _converted(known: Mapping[str, Json], where: str) -> Contract:
+    where = str(description or policy)
     try:
-        contract = msgspec.convert(dict(known), Contract, strict=False)
+        contract = msgspec.convert(facts, Contract, strict=False)
     except msgspec.ValidationError as error:
         raise UsageError(f"{where}: {error}", hint="the guide 'Doctor' has a contract with every key") from None
     sizes = {len(contract.mean), len(contract.std)}
@@ -300,11 +295,25 @@ def _converted(known: Mapping[str, Json], where: str) -> Contract:
         raise UsageError(f"{where}: mean and std need {contract.size} numbers, as the observation has")
     if min(contract.std, default=1.0) <= 0.0:
         raise UsageError(f"{where}: std must be above 0")
-    return contract
+    return Policy(content, contract)
 
 
-def contract_toml(facts: Mapping[str, Json], questions: Mapping[str, str]) -> str:
-    """Return a contract file with a comment for each open question."""
+def _no_gain(name: str, given: Json) -> str:
+    """Return why numbers are no gains; all 0, or all 1.000, are placeholders of an exporter."""
+    try:
+        numbers = np.atleast_1d(list(given.values()) if isinstance(given, dict) else given).astype(float)
+    except (TypeError, ValueError):
+        return ""  # the contract's types refuse it
+    if not numbers.size:
+        return ""
+    if (np.abs(numbers) < 5e-4).all() or (name == "kp" and (np.abs(numbers - 1.0) < 5e-4).all()):
+        return f"the export's {numbers[0]:.3f} everywhere is a placeholder, no gain"
+    return f"the export's {min(numbers):g} is below 0" if min(numbers) < 0 else ""
+
+
+def contract_toml(contract: Contract | Mapping[str, Json], questions: Mapping[str, str] = MappingProxyType({})) -> str:
+    """Return a contract, or what is known of one, as a file with a comment for each open question."""
+    facts = msgspec.to_builtins(contract)
     lines = [f"# {name} = {text}" for name, text in questions.items()]
     for key, value in facts.items():
         if isinstance(value, dict):
@@ -317,43 +326,31 @@ def contract_toml(facts: Mapping[str, Json], questions: Mapping[str, str]) -> st
     return "\n".join(lines) + "\n"
 
 
-def contract_facts(contract: Contract) -> dict[str, Json]:
-    """Return a contract as the facts that ``contract_toml`` writes."""
-    return msgspec.to_builtins(contract)
-
-
 def _read_export(policy: Path) -> tuple[bytes, dict[str, Json]]:
     """Return the network's file, and what the export says about it."""
     if policy.is_dir():
         from sim2real.policy.bundle import GRAPH, read_contract
 
         bundle, _ = read_contract(policy)
-        terms = [
-            {"term": t.name, "size": t.size, "history": t.history}
-            for t in bundle.observation
-            if not t.name.startswith("earlier features")
-        ]
-        earlier = [t for t in bundle.observation if t.name.startswith("earlier features")]
+        terms = [{"term": t.name, "size": t.size, "history": t.history} for t in bundle.observation]
+        earlier = [t for t in terms if t["term"].startswith("earlier features")]
+        terms = [t for t in terms if t not in earlier]
         for term in terms if earlier else ():  # a walking policy remembers all its features but the command
-            term["history"] += earlier[0].history * (not term["term"].startswith("command"))
+            term["history"] += earlier[0]["history"] * (not term["term"].startswith("command"))
         facts: dict[str, Json] = {
-            "rate_hz": bundle.rate_hz,
-            "observation": terms,
-            "history_order": "newest first",
+            "rate_hz": bundle.rate_hz, "observation": terms, "history_order": "newest first",
             "history_layout": "step" if earlier else "term",
-            "source": f"bundle {policy.name}",
-        }
+        }  # fmt: skip
         if trained := bundle.trained_s.get("round_trip_delay"):
             facts["delay_s"] = trained[1]
         return (policy / GRAPH).read_bytes(), facts
-    try:
-        content = policy.read_bytes()
-    except OSError as error:
-        raise UsageError(f"the policy {policy} cannot be read: {error.strerror}") from None
     import onnx
 
     try:
+        content = policy.read_bytes()
         model = onnx.load_from_string(content)
+    except OSError as error:
+        raise UsageError(f"the policy {policy} cannot be read: {error.strerror}") from None
     except Exception:  # protobuf's errors share no base class
         raise UsageError(
             f"{policy} is no ONNX file",
@@ -362,56 +359,107 @@ def _read_export(policy: Path) -> tuple[bytes, dict[str, Json]]:
     return content, _facts_of_metadata({p.key: p.value for p in model.metadata_props})
 
 
+_METADATA = {
+    "default_joint_pos": "default_joint_pos", "action_scale": "action_scale", "kp": "joint_stiffness",
+    "kd": "joint_damping", "rate_hz": "rate_hz", "delay_s": "delay_s", "period": "step_dt",
+}  # fmt: skip
+_TERM_METADATA = {"size": "observation_dims", "scale": "observation_terms_scale",
+                  "history": "observation_terms_history_length|observation_history_lengths"}  # fmt: skip
+"""Fact -> its key in the metadata that mjlab, Isaac Lab's motion tracking and their forks write into an ONNX."""
+
+
 def _facts_of_metadata(data: Mapping[str, str]) -> dict[str, Json]:
-    """Return the facts in the metadata that mjlab, Isaac Lab's motion tracking and their forks write into an ONNX."""
-    facts: dict[str, Json] = {}
-
-    def floats(name: str) -> list[float]:
+    def numbers(keys: str) -> list[float]:
+        key = next((k for k in keys.split("|") if k in data), "")
         try:
-            return [float(v) for v in re.split(r"[\s,;\[\]()]+", data[name]) if v]
+            return [float(v) for v in re.split(r"[\s,;\[\]()]+", data.get(key, "")) if v]
         except ValueError:
-            raise UsageError(f"the metadata {name!r} of the ONNX file holds no numbers: {data[name][:60]}") from None
+            raise UsageError(f"the metadata {key!r} of the ONNX file holds no numbers: {data[key][:60]}") from None
 
+    found = {fact: values for fact, key in _METADATA.items() if (values := numbers(key))}
+    facts: dict[str, Json] = {k: v[0] if k in ("rate_hz", "delay_s", "period") else v for k, v in found.items()}
     if "joint_names" in data:
         facts["joints"] = data["joint_names"].split(",")
-    for name in ("default_joint_pos", "action_scale"):
-        if name in data and (numbers := floats(name)):
-            facts[name] = numbers
-    for ours, theirs in (("kp", "joint_stiffness"), ("kd", "joint_damping")):
-        if theirs in data and (numbers := floats(theirs)):
-            facts |= _gains(ours, numbers, theirs)
     if "observation_names" in data:
         names = data["observation_names"].split(",")
-        several = lambda *keys: next((floats(k) for k in keys if k in data), [])  # noqa: E731
-        sizes = several("observation_dims")
-        histories = several("observation_terms_history_length", "observation_history_lengths")
-        scales = several("observation_terms_scale")
+        columns = {part: values for part, key in _TERM_METADATA.items() if len(values := numbers(key)) == len(names)}
         facts["observation"] = [
-            {
-                "term": name,
-                **({"size": int(sizes[i])} if len(sizes) == len(names) else {}),
-                **({"history": max(1, int(histories[i]))} if len(histories) == len(names) else {}),
-                **({"scale": scales[i]} if len(scales) == len(names) else {}),
-            }
-            for i, name in enumerate(names)
+            _term(name, {part: values[i] for part, values in columns.items()}) for i, name in enumerate(names)
         ]
-    for name in ("rate_hz", "delay_s"):
-        if name in data:
-            facts[name] = float(data[name])
-    if "step_dt" in data:
-        facts["rate_hz"] = 1.0 / float(data["step_dt"])
-    if facts:
-        facts["source"] = "metadata of the ONNX file"
+    return _with_rate(facts)
+
+
+def _term(name: str, given: Mapping[str, Json]) -> dict[str, Json]:
+    """Return a term of the observation, of what a trainer says about it."""
+    scale, term = given.get("scale"), dict[str, Json](term=name)
+    if scale is not None:
+        term["scale"] = scale if isinstance(scale, list) else float(scale)
+    if size := given.get("size") or (len(scale) if isinstance(scale, list) else 0):
+        term["size"] = int(size)
+    return term | {"history": max(1, int(given.get("history") or 1))}
+
+
+def _with_rate(facts: dict[str, Json]) -> dict[str, Json]:
+    if "period" in facts:
+        period_s = float(facts.pop("period"))
+        facts["rate_hz"] = 1.0 / period_s if period_s > 0 else 0.0  # which is refused
     return facts
 
 
-def _gains(name: str, numbers: Sequence[float], theirs: str) -> dict[str, Json]:
-    """Return gains as a fact; gains that are all 0, or all 1.000, are placeholders of an exporter, and refused."""
-    if all(abs(v) < 5e-4 for v in numbers) or (name == "kp" and all(abs(v - 1.0) < 5e-4 for v in numbers)):
-        return {f"{name}_refused": f"the export's {theirs} of {numbers[0]:.3f} everywhere is a placeholder, no gain"}
-    if min(numbers) < 0:
-        return {f"{name}_refused": f"the export's {theirs} of {min(numbers):g} is below 0"}
-    return {name: list(numbers)}
+_YAML = {
+    "step_dt": {"period": "step_dt", "motors": "joint_ids_map",
+                "default_joint_pos": "actions.*.offset|default_joint_pos",
+                "action_scale": "actions.*.scale", "kp": "stiffness", "kd": "damping"},  # unitree_rl_lab
+    "control_dt": {"period": "control_dt", "motors": "leg_joint2motor_idx|num_actions", "kp": "kps", "kd": "kds",
+                   "default_joint_pos": "default_angles", "action_scale": "action_scale"},  # unitree_rl_gym
+    "decimation": {"period": "sim.dt", "default_joint_pos": "scene.robot.init_state.joint_pos",
+                   "action_scale": "actions.*.scale"},  # Isaac Lab
+}  # fmt: skip
+"""Key that tells a format -> where its facts stand: the first path that is there counts."""
+
+
+def _at(data: Json, paths: str) -> Json:
+    """Return what stands at the first of some paths ``a.b|c``; ``*`` is the first entry that has what follows."""
+    for path in paths.split("|"):
+        found: list[Json] = [data]
+        for key in path.split("."):
+            inside = [entry for entry in found if isinstance(entry, dict)]
+            found = [v for e in inside for v in e.values()] if key == "*" else [e[key] for e in inside if key in e]
+        if found and found[0] is not None:
+            return found[0]
+    raise KeyError(paths)
+
+
+def _facts_of_yaml(data: Mapping[str, Json], model_joints: Sequence[str]) -> dict[str, Json]:
+    form = next(key for key in _YAML if key in data)
+    facts: dict[str, Json] = {fact: _at(data, path) for fact, path in _YAML[form].items()}
+    motors = facts.pop("motors", [])
+    motors = [int(m) for m in (range(motors) if isinstance(motors, int) else motors)]
+    if motors and max(motors) < len(model_joints):
+        facts["joints"] = [model_joints[m] for m in motors]
+    if form == "step_dt":  # gains stand in the order of the motors, and positions in the network's
+        facts |= {name: [float(facts[name][m]) for m in motors] for name in ("kp", "kd")}
+        terms = data["observations"]
+    elif form == "control_dt":
+        scales = {"ang_vel": "ang_vel_scale", "gravity": "", "command": "cmd_scale", "joint_pos": "dof_pos_scale",
+                  "joint_vel": "dof_vel_scale", "last_action": ""}  # fmt: skip
+        terms: dict[str, Json] = {term: {"scale": data[key]} if key else {} for term, key in scales.items()}
+        if (phase := int(data["num_obs"]) - 9 - 3 * int(data["num_actions"])) > 0:
+            terms["phase"] = {"size": phase}
+    else:  # the order of the joints is the simulator's, which the file does not have: it is asked
+        facts["period"] = float(facts["period"]) * int(data["decimation"])
+        group = data["observations"]["policy"]
+        shared = {} if group.get("history_length") is None else {"history_length": group["history_length"]}
+        terms = {name: term | shared for name, term in group.items() if isinstance(term, dict) and "func" in term}
+        for name, key in (("kp", "stiffness"), ("kd", "damping")):
+            gains: dict[str, float] = {}
+            for drives in [g for g in data["scene"]["robot"]["actuators"].values() if isinstance(g, dict)]:
+                own = drives.get(key)
+                of = own if isinstance(own, dict) else dict.fromkeys(drives["joint_names_expr"], own)
+                gains |= {pattern: float(value) for pattern, value in of.items() if value is not None}
+            facts |= {name: gains} if gains else {}
+    facts["observation"] = [_term(name, {**t, "history": t.get("history_length")}) for name, t in terms.items()]
+    return _with_rate(facts)
 
 
 def _read_description(path: Path, model_joints: Sequence[str]) -> dict[str, Json]:
@@ -430,15 +478,7 @@ def _read_description(path: Path, model_joints: Sequence[str]) -> dict[str, Json
                 f"{path} has an open question: {question[0].lstrip('# ')}",
                 hint=f"put the answer in place of the line, such as {question[1]} = ...",
             )
-        refused = {}
-        for name in ("kp", "kd"):
-            if name in facts:
-                given = facts[name]
-                numbers = list(given.values()) if isinstance(given, dict) else np.atleast_1d(given).tolist()
-                if name not in (checked := _gains(name, numbers, name)):
-                    del facts[name]
-                    refused |= checked
-        return facts | refused
+        return facts
     import yaml
 
     loader = type("Loader", (yaml.SafeLoader,), {})  # Isaac Lab's files have tags of Python's own types
@@ -447,21 +487,15 @@ def _read_description(path: Path, model_joints: Sequence[str]) -> dict[str, Json
         data = yaml.load(text, loader)
     except yaml.YAMLError as error:
         raise UsageError(f"{path} is no YAML: {error}") from None
-    if not isinstance(data, dict):
-        raise UsageError(f"{path} holds no keys")
+    if not isinstance(data, dict) or not any(key in data for key in _YAML):
+        raise UsageError(
+            f"{path} has neither step_dt (unitree_rl_lab), control_dt (unitree_rl_gym) nor decimation (Isaac Lab)",
+            hint=f"write a {FILE} instead: the guide 'Doctor' has one",
+        )
     try:
-        if "step_dt" in data:
-            return _unitree_rl_lab(data, model_joints)
-        if "control_dt" in data:
-            return _unitree_rl_gym(data, model_joints)
-        if "decimation" in data:
-            return _isaac_lab(data)
-    except (KeyError, TypeError, ValueError, IndexError) as error:
+        return _facts_of_yaml(data, model_joints)
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
         raise UsageError(f"{path} lacks a part of its format, or has it in another form: {error!r}") from None
-    raise UsageError(
-        f"{path} has neither step_dt (unitree_rl_lab), control_dt (unitree_rl_gym) nor decimation (Isaac Lab)",
-        hint=f"write a {FILE} instead: the guide 'Doctor' has one",
-    )
 
 
 def _plain_node(loader: Any, suffix: str, node: Any) -> Json:
@@ -470,93 +504,3 @@ def _plain_node(loader: Any, suffix: str, node: Any) -> Json:
     if isinstance(node, yaml.SequenceNode):
         return loader.construct_sequence(node, deep=True)
     return loader.construct_mapping(node, deep=True) if isinstance(node, yaml.MappingNode) else suffix
-
-
-def _joints_by_motor(motors: Sequence[int], model_joints: Sequence[str]) -> dict[str, Json]:
-    """Return the joints of a list of motors' numbers, if the model has all of them."""
-    if not model_joints or max(motors) >= len(model_joints):
-        return {}
-    return {"joints": [model_joints[m] for m in motors]}
-
-
-def _unitree_rl_lab(data: Mapping[str, Json], model_joints: Sequence[str]) -> dict[str, Json]:
-    motors = [int(m) for m in data["joint_ids_map"]]
-    action = next(iter(data["actions"].values()))
-    # Gains stand in the order of the motors, and positions in the network's.
-    gains = {
-        name: [float(data[key][m]) for m in motors] for name, key in (("kp", "stiffness"), ("kd", "damping"))
-    }  # fmt: skip
-    return {
-        "rate_hz": 1.0 / float(data["step_dt"]),
-        **_joints_by_motor(motors, model_joints),
-        "default_joint_pos": action.get("offset") or data["default_joint_pos"],
-        "action_scale": action["scale"],
-        **_gains("kp", gains["kp"], "stiffness"),
-        **_gains("kd", gains["kd"], "damping"),
-        "observation": [
-            {
-                "term": name,
-                "history": max(1, int(term.get("history_length") or 1)),
-                **({"scale": term["scale"]} if term.get("scale") is not None else {}),
-                **({"size": len(term["scale"])} if isinstance(term.get("scale"), list) else {}),
-            }
-            for name, term in data["observations"].items()
-        ],
-        "source": "deploy.yaml of unitree_rl_lab",
-    }
-
-
-def _unitree_rl_gym(data: Mapping[str, Json], model_joints: Sequence[str]) -> dict[str, Json]:
-    motors = data.get("leg_joint2motor_idx", range(int(data["num_actions"])))
-    phase = int(data["num_obs"]) - 9 - 3 * int(data["num_actions"])
-    terms: list[dict[str, Json]] = [
-        {"term": "ang_vel", "scale": float(data["ang_vel_scale"])},
-        {"term": "gravity"},
-        {"term": "command", "scale": data["cmd_scale"]},
-        {"term": "joint_pos", "scale": float(data["dof_pos_scale"])},
-        {"term": "joint_vel", "scale": float(data["dof_vel_scale"])},
-        {"term": "last_action"},
-        *([{"term": "phase", "size": phase}] if phase > 0 else []),
-    ]
-    return {
-        "rate_hz": 1.0 / float(data["control_dt"]),
-        **_joints_by_motor(list(motors), model_joints),
-        "default_joint_pos": data["default_angles"],
-        "action_scale": data["action_scale"],
-        **_gains("kp", data["kps"], "kps"),
-        **_gains("kd", data["kds"], "kds"),
-        "observation": terms,
-        "source": "configuration of unitree_rl_gym",
-    }
-
-
-def _isaac_lab(data: Mapping[str, Json]) -> dict[str, Json]:
-    group = data["observations"]["policy"]
-    shared = group.get("history_length")
-    facts: dict[str, Json] = {
-        "rate_hz": 1.0 / (float(data["sim"]["dt"]) * int(data["decimation"])),
-        "observation": [
-            {
-                "term": name,
-                "history": max(1, int(shared if shared is not None else term.get("history_length") or 1)),
-                **({"scale": term["scale"]} if isinstance(term.get("scale"), int | float | list) else {}),
-            }
-            for name, term in group.items()
-            if isinstance(term, dict) and "func" in term
-        ],
-        "source": "env.yaml of Isaac Lab",
-    }
-    action = next(a for a in data["actions"].values() if isinstance(a, dict) and "scale" in a)
-    # The order of the joints is the simulator's, which the file does not have: it is asked. The rest is by name.
-    robot = data["scene"]["robot"]
-    groups = [g for g in robot["actuators"].values() if isinstance(g, dict)]
-    facts |= {"action_scale": action["scale"], "default_joint_pos": robot["init_state"]["joint_pos"]}
-    for name, key in (("kp", "stiffness"), ("kd", "damping")):
-        gains: dict[str, float] = {}
-        for group in groups:
-            own = group.get(key)
-            of = own if isinstance(own, dict) else dict.fromkeys(group["joint_names_expr"], own)
-            gains |= {pattern: float(value) for pattern, value in of.items() if value is not None}
-        checked = _gains(name, list(gains.values()), key) if gains else {}
-        facts |= {name: gains} if name in checked else checked
-    return facts

@@ -1,20 +1,23 @@
-"""All questions about one deployment, cheap ones first, and the sentence that answers them."""
+"""All questions about one deployment, cheap ones first, with that of timing, and the sentence that answers them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from sim2real.doctor.contract import Policy
+import numpy as np
+
+from sim2real.doctor.contract import Contract, Policy
 from sim2real.doctor.log import Log
 from sim2real.doctor.plant import Drives, solve_plant
 from sim2real.doctor.solve import Finding, solve_contract
-from sim2real.doctor.timing import solve_timing
 from sim2real.errors import UsageError
 
 _UNEXPLAINED = 0.45
 """A replay whose error stays above this share of the joints' motion has a cause that no question names."""
+
+_RATE_BAND, _JITTER, _LOST, _OLDER_S = 0.04, 0.25, 0.02, 0.015
 
 
 @dataclass(frozen=True)
@@ -57,10 +60,8 @@ class Diagnosis:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the diagnosis as plain data."""
-        findings = [{"fault": f.fault, "question": f.question, "text": f.text, "share": round(f.share, 4),
-                     "numbers": dict(f.numbers)} for f in self.findings]  # fmt: skip
-        return {"sentence": self.sentence, "faults": self.faults, "findings": findings, "figures": dict(self.figures),
-                "skipped": dict(self.skipped), "unexplained": self.unexplained}  # fmt: skip
+        found = {"sentence": self.sentence, "faults": self.faults, "unexplained": self.unexplained}
+        return found | asdict(self)
 
 
 def diagnose(policy: Policy, log: Log, drives: Drives | None = None, sim: Log | None = None,
@@ -93,3 +94,34 @@ def diagnose(policy: Policy, log: Log, drives: Drives | None = None, sim: Log | 
     order = {"contract": 0, "timing": 1, "plant": 2}
     ranked = sorted(best.values(), key=lambda f: (order[f.question], -f.share))
     return Diagnosis(tuple(ranked), figures, skipped)
+
+
+def solve_timing(log: Log, contract: Contract, sim: Log | None = None) -> tuple[list[Finding], dict[str, float]]:
+    """Return what is wrong with the times of the policy's steps, and their figures [Hz, s].
+
+    Args:
+        sim: The log of a simulation, whose rate and ages count as those of the training.
+    """
+    steps = np.diff(log.t)
+    period = float(np.median(steps))
+    wanted = 1.0 / contract.rate_hz if sim is None else float(np.median(np.diff(sim.t)))
+    jitter_s, lost = float(np.quantile(np.abs(steps - period), 0.9)), float(np.mean(steps > 1.6 * period))
+    figures = {"rate_hz": 1.0 / period, "trained_rate_hz": 1.0 / wanted, "jitter_s": jitter_s, "lost": lost}
+    findings = []
+
+    def check(wrong: bool, fault: str, share: float, name: str, text: str) -> None:
+        if wrong:
+            findings.append(Finding(fault, "timing", text, share, {name: figures[name]}))
+
+    check(abs(period / wanted - 1.0) > _RATE_BAND, "rate", min(1.0, abs(wanted / period - 1.0)), "rate_hz",
+          f"the policy makes {1 / period:.4g} steps in a second, and was trained with {1 / wanted:.4g}")  # fmt: skip
+    check(jitter_s > _JITTER * period, "jitter", 0.0, "jitter_s",
+          f"a tenth of the steps come {1e3 * jitter_s:.1f} ms or more beside their time")  # fmt: skip
+    check(lost > _LOST, "losses", lost, "lost", f"{lost:.1%} of the policy's steps are missing")
+    if log.age_s is not None and len(log.age_s):
+        age_s = float(np.median(log.age_s))
+        figures |= {"age_s": age_s, "age_99_s": float(np.quantile(log.age_s, 0.99))}
+        trained_s = 0.0 if sim is None or sim.age_s is None else float(np.median(sim.age_s))
+        check(age_s > trained_s + _OLDER_S, "delay", 0.0, "age_s",
+              f"each action answers a measurement that is {1e3 * age_s:.0f} ms old")  # fmt: skip
+    return findings, figures

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,7 @@ _NAMES = {
 """Signal -> its names in a file, whose last part counts: ``sensor.position``."""
 _OF_NAME = {name: signal for signal, names in _NAMES.items() for name in names.split()}
 _STATES = ("q", "dq", "quat", "gyro", "lin_vel")
+_OF_STEPS = ("command", "obs", "action", "target")
 _UNUSED_NODES = ("world", "truth")
 
 
@@ -45,7 +47,7 @@ class Log:
         obs: Observations before normalising ``(N, O)``.
         action: Outputs of the network ``(N, A)``.
         target: Commands to the drives ``(N, J)``, in the contract's order.
-        age_s: Age of the measurement that each step answers ``(N,)``, if the log has the messages [s].
+        message_age_s: Ages of the measurements that the steps answer, if the log has the messages [s].
     """
 
     t: np.ndarray
@@ -59,12 +61,23 @@ class Log:
     obs: np.ndarray | None = None
     action: np.ndarray | None = None
     target: np.ndarray | None = None
-    age_s: np.ndarray | None = None
+    message_age_s: np.ndarray | None = None
 
     @property
     def rows_are_steps(self) -> bool:
         """Whether the measurements were logged by the policy's own loop, one for each step."""
         return len(self.t) == len(self.state_t) and bool(np.allclose(self.t, self.state_t, atol=2e-3))
+
+    @cached_property
+    def age_s(self) -> np.ndarray | None:
+        """Ages of the measurements that the steps answer [s]: by the messages, or of the newest ones."""
+        if self.message_age_s is not None or self.rows_are_steps:
+            return self.message_age_s
+        return self.t - self.state_t[self._rows(0.0)]
+
+    def _rows(self, lag_s: float) -> np.ndarray:
+        rows = np.searchsorted(self.state_t, self.t - lag_s + 1e-6, side="right") - 1
+        return np.clip(rows, 0, len(self.state_t) - 1)
 
     def at_steps(self, name: str, lag_s: float = 0.0) -> np.ndarray:
         """Return a measured signal at the policy's steps, ``lag_s`` earlier; between measurements the older counts."""
@@ -74,73 +87,70 @@ class Log:
             low = np.clip(np.floor(rows + 1e-6).astype(int), 0, len(values) - 1)
             high, share = np.minimum(low + 1, len(values) - 1), np.clip(rows - low, 0.0, 1.0)[:, None]
             return values[low] if not np.any(share > 1e-6) else (1 - share) * values[low] + share * values[high]
-        rows = np.searchsorted(self.state_t, self.t - lag_s + 1e-6, side="right") - 1
-        return values[np.clip(rows, 0, len(values) - 1)]
+        return values[self._rows(lag_s)]
 
 
-def read_deployment(path: Path, joints: Sequence[str], actions: int, robot_joints: Sequence[str] = ()) -> Log:
+@dataclass(frozen=True)
+class _Signal:
+    """Rows ``(K, C)``, their times (none: those of the steps), and the names of the columns."""
+
+    values: np.ndarray
+    t: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    columns: Sequence[str] = ()
+
+
+def read_deployment(path: Path, joints: Sequence[str], robot_joints: Sequence[str] = ()) -> Log:
     """Read a log of this project, or a CSV, NPZ, JSON or bag with a row for each step of the policy.
 
     Args:
         joints: The joints of the contract, which are sought in the names of the columns.
-        actions: Number of the policy's actions.
         robot_joints: The joints in the order of columns without names; default: the contract's.
 
     Raises:
         UsageError: The file cannot be read, or has no times, positions or commands.
     """
-    signals, stamps, named, age_s = _signals(path)
-    found: dict[str, np.ndarray] = {}
-    times: dict[str, np.ndarray] = {}
-    for name, values in signals.items():
-        signal = _signal_of(name)
-        if signal is not None and signal not in found:
-            found[signal], times[signal] = np.asarray(values, float), stamps.get(name, np.zeros(0))
-            if signal in ("q", "dq", "target"):
-                found[signal] = _in_order(found[signal], named.get(name, []) or robot_joints, joints, name)
-    step_t = found.get("t")
-    for name in ("action", "obs", "target"):
-        if step_t is None and name in found and len(times[name]):
-            step_t = times[name]
-    state_t = found.get("state_t")
-    if state_t is None and "q" in found:
-        state_t = times["q"] if len(times["q"]) == len(found["q"]) else step_t
-    if missing := [n for n, v in (("times t", step_t), ("positions q", found.get("q"))) if v is None]:
+    signals, age_s = _signals(path)
+    found: dict[str, _Signal] = {}
+    for name, signal in signals.items():
+        if (kind := _kind_of(name)) is not None and kind not in found:
+            found[kind] = _in_order(signal, robot_joints, joints, name) if kind in ("q", "dq", "target") else signal
+    stamps = [found[n].t for n in ("action", "obs", "target") if n in found and len(found[n].t)]
+    step_t = found["t"].values if "t" in found else stamps[0] if stamps else None
+    if missing := [n for n, lacks in (("times t", step_t is None), ("positions q", "q" not in found)) if lacks]:
         raise UsageError(
             f"{path} has no {' and no '.join(missing)}. It has {', '.join(signals) or 'nothing'}",
             hint="the guide 'Doctor' lists the signals and their names",
         )
     assert step_t is not None
-    assert state_t is not None
     if "action" not in found and "target" not in found:
         raise UsageError(f"{path} has neither actions nor targets, so nothing of the policy")
-    count = {len(found[n]) for n in ("obs", "action", "target") if n in found and len(found[n]) == len(step_t)}
-    if count != {len(step_t)} or len(step_t) < 20:
+    if len(step_t) < 20 or not any(len(found[n].values) == len(step_t) for n in _OF_STEPS[1:] if n in found):
         raise UsageError(f"{path} has {len(step_t)} times of steps; actions, targets or observations do not fit them")
+    q = found["q"]
+    state_t = found["state_t"].values if "state_t" in found else q.t if len(q.t) == len(q.values) else step_t
     if "dq" not in found:
-        found["dq"] = np.gradient(found["q"], state_t, axis=0)
+        found["dq"] = _Signal(np.gradient(q.values, state_t, axis=0), state_t)
     order = np.argsort(state_t, kind="stable")
-    state_t = np.asarray(state_t)[order]
-    states, others = {}, {}
-    for name, values in found.items():
-        if not np.isfinite(values).all():
+    parts: dict[str, np.ndarray] = {}
+    for name, signal in found.items():
+        if not np.isfinite(signal.values).all():
             raise UsageError(f"{path}: {name} has values that are not finite")
         if name in _STATES:
-            own = len(values) == len(order)
-            states[name] = values[order] if own else _at(values, times[name], state_t, f"{path}: {name}")
-        elif name in ("command", "obs", "action", "target"):
-            others[name] = _at(values, times[name], step_t, f"{path}: {name}")
-    if others.get("action") is not None and others["action"].shape[1] != actions:
-        raise UsageError(f"{path}: action has {others['action'].shape[1]} columns, the policy {actions}")
-    return Log(step_t, state_t, age_s=age_s, **states, **others)
+            parts[name] = _at(signal, state_t, f"{path}: {name}")[order]
+        elif name in _OF_STEPS:
+            parts[name] = _at(signal, step_t, f"{path}: {name}")
+    if "action" in parts and parts["action"].shape[1] != len(joints):
+        raise UsageError(f"{path}: action has {parts['action'].shape[1]} columns, the policy {len(joints)}")
+    return Log(step_t, state_t[order], message_age_s=age_s, **parts)
 
 
-def _at(values: np.ndarray, times: np.ndarray, wanted: np.ndarray, what: str) -> np.ndarray:
+def _at(signal: _Signal, wanted: np.ndarray, what: str) -> np.ndarray:
     """Return a signal at other times: the newest value then; a single row holds for all.
 
     Raises:
         UsageError: It has another number of rows, and no times of its own.
     """
+    values, times = signal.values, signal.t
     if len(values) == len(wanted):
         return values
     if len(values) == 1:
@@ -150,39 +160,38 @@ def _at(values: np.ndarray, times: np.ndarray, wanted: np.ndarray, what: str) ->
     return values[np.clip(np.searchsorted(times, wanted + 1e-6, side="right") - 1, 0, len(values) - 1)]
 
 
-def _signal_of(name: str) -> str | None:
-    """Return the signal of a name; an angle or a torque of a command is a target, a measured torque is not used."""
+def _kind_of(name: str) -> str | None:
+    """Return the kind of a signal; an angle or a torque of a command is a target, a measured torque is not used."""
     *nodes, last = re.split(r"[./]", name.lower())
     if nodes[:1] and nodes[0] in _UNUSED_NODES:
         return None
-    signal = _OF_NAME.get(last)
+    kind = _OF_NAME.get(last)
     if nodes[:1] == ["agent"]:
-        return signal if signal in ("action", "obs", "command") else None
+        return kind if kind in ("action", "obs", "command") else None
     if any(node == "actuator" or node.endswith("cmd") for node in nodes):
-        return "target" if signal in ("q", "target", "action", "torque") else None
-    return None if signal == "torque" else signal
+        return "target" if kind in ("q", "target", "action", "torque") else None
+    return None if kind == "torque" else kind
 
 
-def _in_order(values: np.ndarray, names: Sequence[str], joints: Sequence[str], signal: str) -> np.ndarray:
-    """Return the columns of the joints in the contract's order; without names they count as in this order."""
+def _in_order(signal: _Signal, robot_joints: Sequence[str], joints: Sequence[str], name: str) -> _Signal:
+    """Return the columns of the joints in the contract's order; without names they come in the robot's order."""
+    names = signal.columns or robot_joints
     if not names:
-        if values.ndim != 2 or values.shape[1] != len(joints):
+        if signal.values.ndim != 2 or signal.values.shape[1] != len(joints):
             raise UsageError(
-                f"{signal} has {values.shape[1:]} columns without names, the contract {len(joints)} joints",
+                f"{name} has {signal.values.shape[1:]} columns without names, the contract {len(joints)} joints",
                 hint="name the columns, such as q.FL_hip_joint",
             )
-        return values
+        return signal
     exact = [names.index(j) for j in joints if j in names]
     found = (exact, "") if len(exact) == len(joints) else columns_of(joints, names)
     if found is None:
-        raise UsageError(f"{signal} has the columns {', '.join(names)}; the contract's joints: {', '.join(joints)}")
-    return values[:, found[0]]
+        raise UsageError(f"{name} has the columns {', '.join(names)}; the contract's joints: {', '.join(joints)}")
+    return replace(signal, values=signal.values[:, found[0]])
 
 
-def _signals(
-    path: Path,
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, list[str]], np.ndarray | None]:
-    """Return signals, their times and the names of their columns; and ages of observations."""
+def _signals(path: Path) -> tuple[dict[str, _Signal], np.ndarray | None]:
+    """Return the signals of a file by their names, and the ages of observations."""
     from sim2real.log.importing.readers import open_tables
     from sim2real.log.writer import LIBRARY
 
@@ -191,8 +200,8 @@ def _signals(
             if LIBRARY.split()[0].encode() in file.read(200):
                 return _own_log(path)
     table = open_tables(path)[0]
-    signals: dict[str, np.ndarray] = {}
-    named: dict[str, list[str]] = {}
+    of_file = next((list(words) for name, words in table.words.items() if name in ("joints", "joint_names")), [])
+    signals: dict[str, _Signal] = {}
     joined: dict[str, list[tuple[str, np.ndarray]]] = {}
     for name, values in table.columns.items():
         # One column for each joint, or each entry: `q.FL_hip_joint`, `observation[3]`, `action_0`.
@@ -200,40 +209,31 @@ def _signals(
         if np.ndim(values) == 1 and match and _OF_NAME.get(match[1].lower()):
             joined.setdefault(match[1], []).append((match[2], values))
         elif np.ndim(values) == 2 or _OF_NAME.get(name.lower()) in ("t", "state_t"):
-            signals[name] = values
-            named[name] = table.names.get(name, [])
+            signals[name] = _Signal(np.asarray(values, float), columns=of_file or table.names.get(name, []))
     for name, columns in joined.items():
-        signals[name] = np.stack([v for _, v in columns], axis=1)
         labels = [label for label, _ in columns]
-        named[name] = [] if all(re.fullmatch(r"\d+", label) for label in labels) else labels
-    for name in [n for n in signals if n.lower().endswith("_joints")]:
-        del signals[name]
-    for name, words in table.words.items():  # npz: joints = ["FL_hip_joint", ...]
-        if name in ("joints", "joint_names"):
-            named |= {n: list(words) for n in signals if _signal_of(n) in ("q", "dq", "target")}
-    return signals, {}, named, None
+        numbered = all(re.fullmatch(r"\d+", label) for label in labels)
+        values = np.stack([np.asarray(v, float) for _, v in columns], axis=1)
+        signals[name] = _Signal(values, columns=of_file or ([] if numbered else labels))
+    return signals, None
 
 
-def _own_log(
-    path: Path,
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, list[str]], np.ndarray | None]:
+def _own_log(path: Path) -> tuple[dict[str, _Signal], np.ndarray | None]:
     from sim2real.log.reader import read_log
 
     episode = read_log(path)
-    signals, stamps, named = {}, {}, {}
+    signals, age_s = {}, None
     joints = episode.metadata.get("joints", [])
     for node, output in episode.outputs.items():
-        for field, values in output.items():
-            name = f"{node}.{field}"
-            signals[name] = values if np.ndim(values) > 1 else np.asarray(values)[:, None]
-            steps = episode.steps[node]
-            stamps[name] = steps.begun_s if _signal_of(name) in _STATES else steps.end / 1e6
-            named[name] = list(joints) if signals[name].shape[1] == len(joints) else []
-    age_s = None
+        steps = episode.steps[node]
+        for name, field_values in ((f"{node}.{leaf}", v) for leaf, v in output.items()):
+            values = np.asarray(field_values, float)
+            values = values if values.ndim > 1 else values[:, None]
+            times = steps.begun_s if _kind_of(name) in _STATES else steps.end / 1e6
+            signals[name] = _Signal(values, times, joints if values.shape[1] == len(joints) else ())
     for (node, source), messages in episode.messages.items():
         if source == "sensor" and node in ("agent", "policy") and len(messages):
-            used = messages.seq_in >= 0
-            begun = episode.steps[node].begun_s
-            ok = used & (messages.seq_in < len(begun)) & (messages.seq_out < len(episode.steps[source]))
-            age_s = begun[messages.seq_in[ok]] - episode.steps[source].begun_s[messages.seq_out[ok]]
-    return signals, stamps, named, age_s
+            begun, ended = episode.steps[node].begun_s, episode.steps[source].begun_s
+            ok = (messages.seq_in >= 0) & (messages.seq_in < len(begun)) & (messages.seq_out < len(ended))
+            age_s = begun[messages.seq_in[ok]] - ended[messages.seq_out[ok]]
+    return signals, age_s

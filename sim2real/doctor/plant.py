@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -15,18 +15,17 @@ import numpy as np
 
 from sim2real.doctor.contract import Contract
 from sim2real.doctor.log import Log
-from sim2real.doctor.solve import Finding, matrices
+from sim2real.doctor.solve import Finding, known, matrices, shortened
 from sim2real.errors import UsageError
 
 _STEP_S, _WINDOW_S, _WINDOWS = 0.0025, 0.2, 40
 _LATER_S = 0.010
 """A delay that is longer by this than that of the training is a fault [s]; a training without a known delay had none,
 and the first 10 ms are those of any robot."""
+_LOWER = 0.75
+"""A torque limit is a fault if it is below this share of the model's: drives that lag look limited a little earlier."""
 _UPRIGHT = 0.8
 """Cosine of the tilt up to which a free robot stands."""
-_GAIN_BAND = (0.72, 1.4)
-_CLEAR = 1.08
-"""A parameter is at fault if the replay's error grows by this factor with the model's value."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +53,8 @@ GRIDS: dict[str, tuple[float, ...]] = {
     "kp": (0.35, 0.5, 0.65, 0.8, 1.25, 1.6, 2.2),
     "friction": (0.2, 3.0, 6.0, 12.0),
     "payload": (-0.1, 0.1, 0.2, 0.4),
+    "limits": (0.05, 0.08, 0.12, 0.17, 0.24, 0.33, 0.45, 0.6),
 }
-_LIMITS = (0.05, 0.08, 0.12, 0.17, 0.24, 0.33, 0.45, 0.6)
 _NOMINAL = Plant()
 
 
@@ -116,12 +115,10 @@ class Drives:
         self.limit = np.array(limits)
         for element in (*spec.actuators, *spec.keys, *spec.sensors):
             spec.delete(element)
-        for joint, p, d in zip(contract.joints, self.kp, self.kd, strict=True):
+        for joint in contract.joints:  # their gains and limits are those of ``with_plant``
             actuator = spec.add_actuator(name=f"doctor_{joint}", target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-            actuator.gainprm[0] = p
             if not self.torque_driven:
                 actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
-                actuator.biasprm[1:3] = -p, -d
             actuator.forcelimited, actuator.forcerange = True, [-1e6, 1e6]
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         spec.option.timestep = min(_STEP_S, spec.option.timestep)
@@ -132,6 +129,10 @@ class Drives:
         # The body that a payload adds to: the heaviest of a free robot, the outermost of a fixed one.
         moved = self.model.jnt_bodyid[[self.model.joint(j).id for j in contract.joints]]
         self.loaded = int(np.argmax(self.model.body_mass)) if self.free else int(moved[-1])
+
+    def torque(self, target: np.ndarray, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
+        """Return the torques that targets ask for [N m]."""
+        return target if self.torque_driven else self.kp * (target - q) - self.kd * dq
 
     def with_plant(self, plant: Plant, asked: np.ndarray) -> Any:
         """Return a copy of the model with other drives; ``asked``: the largest torques of the targets ``(J,)``."""
@@ -179,14 +180,12 @@ class Replay:
         travel = np.sqrt(np.mean((self.measured - log.q[self.starts][:, None]) ** 2, (0, 1)))
         self.scale = np.maximum(travel, 0.3 * np.median(travel) + 1e-4)
         self._threads = [mujoco.MjData(drives.model) for _ in range(min(2, os.cpu_count() or 1))]
-        self._known: dict[Plant, np.ndarray] = {}
+        self._errors: dict[Plant, np.ndarray] = {}
 
     @cached_property
     def asked(self) -> np.ndarray:
         """The largest torques that the targets ask for ``(J,)`` [N m]."""
-        q, dq, target = self.log.at_steps("q"), self.log.at_steps("dq"), self.log.target
-        assert target is not None
-        torque = target if self.drives.torque_driven else self.drives.kp * (target - q) - self.drives.kd * dq
+        torque = self.drives.torque(known(self.log.target), self.log.at_steps("q"), self.log.at_steps("dq"))
         return np.quantile(np.abs(torque), 0.99, axis=0) + 1e-6
 
     def _state(self, k: int) -> np.ndarray:
@@ -219,84 +218,90 @@ class Replay:
 
     def residuals(self, plant: Plant) -> np.ndarray:
         """Return the simulated angles less the measured ones, as a share of the motion ``(W, T, J)``."""
-        if plant not in self._known:
-            from mujoco import rollout
+        from mujoco import rollout
 
-            log, d = self.log, self.drives
-            assert log.target is not None
-            times = log.state_t[self.starts][:, None] + self.step_t[None] - plant.delay_s + 1e-6
-            control = log.target[np.clip(np.searchsorted(log.t, times, side="right") - 1, 0, len(log.t) - 1)]
-            model = d.with_plant(plant, self.asked)
-            state, _ = rollout.rollout(model, self._threads, self.initial, control)
-            angles = np.asarray(state)[:, :, 1 + d.qpos]
-            error = np.nan_to_num((angles - self.measured) / self.scale, nan=9.0)
-            self._known[plant] = np.where(self.used[:, :, None], error, 0.0)
-        return self._known[plant]
+        log, d = self.log, self.drives
+        times = log.state_t[self.starts][:, None] + self.step_t[None] - plant.delay_s + 1e-6
+        control = known(log.target)[np.clip(np.searchsorted(log.t, times, side="right") - 1, 0, len(log.t) - 1)]
+        state, _ = rollout.rollout(d.with_plant(plant, self.asked), self._threads, self.initial, control)
+        error = (np.asarray(state)[:, :, 1 + d.qpos] - self.measured) / self.scale
+        return np.where(self.used[:, :, None], np.nan_to_num(error, nan=9.0), 0.0)
 
     def error(self, plant: Plant) -> float:
         """Return the mean error of the replay as a share of the joints' motion; each counts at most 1.5."""
-        return float(np.minimum(np.abs(self.residuals(plant)), 1.5).sum() / (self.used.sum() * len(self.scale)))
+        return float(self.errors(plant).sum() / (self.used.sum() * len(self.scale)))
+
+    def errors(self, plant: Plant) -> np.ndarray:
+        """Return the errors of windows and joints ``(W, J)``, summed over their used rows."""
+        if plant not in self._errors:
+            self._errors[plant] = np.minimum(np.abs(self.residuals(plant)), 1.5).sum(1)
+        return self._errors[plant]
+
+    def mixed(self, plants: Sequence[Plant]) -> Plant:
+        """Return the first plant, in which each joint has the limit under which it moves best.
+
+        A joint has one only if that explains a tenth of its error.
+        """
+        limits = np.array([p.limits or (np.inf,) * len(self.scale) for p in plants])
+        errors = np.array([self.errors(p).sum(0) for p in plants]) * np.where(np.isinf(limits), 0.9, 1.0)
+        chosen = np.take_along_axis(limits, errors.argmin(0)[None], 0)[0]
+        return replace(plants[0], limits=tuple(chosen.tolist()) if np.isfinite(chosen).any() else ())
+
+    def _near(self, plant: Plant, name: str) -> list[Plant]:
+        value = getattr(plant, name)
+        if name == "limits":
+            moved = [replace(plant, limits=tuple(f * v for v in value)) for f in (0.87, 0.93, 1.07, 1.15)]
+            return [self.mixed([plant, *moved])]
+        values = value * np.array([0.85, 0.93, 1.07, 1.17])
+        if name == "payload":
+            values = value + np.array([-0.05, 0.05])
+        if name == "delay_s":
+            values = np.maximum(0.0, value + np.array([-0.006, -0.002, -0.001, 0.001, 0.002, 0.006]))
+        return [replace(plant, **{name: float(v)}) for v in values]
 
     def polished(self, plant: Plant, names: Sequence[str], sweeps: int = 3) -> Plant:
         """Return the best plant near one, one parameter after the other."""
         for _ in range(sweeps):
             before = plant
             for name in names:
-                values = _near(name, getattr(plant, name))
-                plant = min((plant, *(replace(plant, **{name: float(v)}) for v in values)), key=self.error)
+                plant = min((plant, *self._near(plant, name)), key=self.error)
             if plant == before:
                 break
         return plant
 
     def fit(self, start: Plant, name: str = "", delays: Sequence[float] = GRIDS["delay_s"]) -> Plant:
-        """Return the best plant with another delay, and with another value of one parameter, if one is named."""
-        values = [getattr(start, name), *GRIDS[name]] if name else [0.0]
-        grid = [replace(start, delay_s=d, **({name: float(v)} if name else {})) for d in delays for v in values]
-        return self.polished(min(grid, key=self.error), ["delay_s", *([name] if name else []), "kd"])
-
-    def fit_limits(self, start: Plant, delays: Sequence[float]) -> Plant:
-        """Return the best plant with torque limits: a joint's own motion decides about its limit."""
-        best = start
-        each = lambda plant: np.minimum(np.abs(self.residuals(plant)), 1.5).mean((0, 1))  # noqa: E731
-        for delay_s in delays:
-            free = replace(start, delay_s=delay_s, limits=())
-            tried = np.array([each(replace(free, limits=(f,) * len(self.scale))) for f in _LIMITS])
-            found = np.where(tried.min(0) < 0.9 * each(free), np.array(_LIMITS)[tried.argmin(0)], np.inf)
-            if np.isfinite(found).any():
-                best = min(best, replace(free, limits=tuple(found)), key=self.error)
-        for factor in (0.87, 1.15, 0.93, 1.07) if best.limits else ():
-            moved = replace(best, limits=tuple(factor * v for v in best.limits))
-            better = each(moved) < each(best)
-            mixed = replace(best, limits=tuple(np.where(better, moved.limits, best.limits)))
-            best = min(best, mixed, key=self.error)
-        return self.polished(best, ["delay_s", "kd"])
+        """Return the best plant with another delay and damping, and another value of one parameter, if it is named."""
+        tried = [replace(start, delay_s=d) for d in delays]
+        if name == "limits":
+            # Other gains of one joint, which are no fault, look like its limit.
+            gains = [{"kp": p * start.kp, "kd": d * start.kd} for p in (0.85, 1.0, 1.18) for d in (0.7, 1.0, 1.4)]
+            changes = [{"limits": (f,) * len(self.scale)} for f in GRIDS["limits"]] + gains
+            tried = [self.mixed([s, *(replace(s, **change) for change in changes)]) for s in tried]
+        elif name:
+            tried = [replace(s, **{name: v}) for s in tried for v in (getattr(s, name), *GRIDS[name])]
+        best = min(tried, key=self.error)
+        if name not in ("friction", "payload"):
+            return self.polished(best, ["delay_s", *([name] if name else []), "kd"])
+        if self.error(best) > 0.9 * self.error(start):
+            return start
+        return self.polished(best, [name, "delay_s", *(["kp"] if start.kp != 1.0 else [])], 2)
 
     def fit_all(self) -> Plant:
         """Return the plant with as few changes as explain the motion."""
-        plant = self.fit(_NOMINAL)
-        # Soft or limited drives look late at first, so their own fit looks at shorter delays too.
-        near = sorted({0.004, 0.011, 0.018, plant.delay_s, 0.6 * plant.delay_s})
-        softer, limited = self.fit(_NOMINAL, "kp", near), self.fit_limits(_NOMINAL, near)
-        best = min(softer, limited, key=self.error)
-        if self.error(best) > 0.93 * self.error(plant):
-            best = plant
-        else:
-            more = self.fit_limits(best, near) if best.kp != 1.0 else self.fit(best, "kp", near)
-            best = more if self.error(more) < 0.85 * self.error(best) else best
-        for name in ("friction", "payload"):
-            more = min((replace(best, **{name: v}) for v in GRIDS[name]), key=self.error)
-            if self.error(more) < 0.9 * self.error(best):
-                more = self.polished(more, [name, "delay_s", *(["kp"] if best.kp != 1.0 else [])], 2)
-                best = more if self.error(more) < 0.85 * self.error(best) else best
+        best = self.fit(_NOMINAL)
+        for names, clear in ((["kp", "limits"], 0.93), (["friction"], 0.85), (["payload"], 0.85)):
+            while names:
+                # Soft or limited drives look late and damped at first.
+                start, delays = best, [best.delay_s]
+                if names[0] in ("kp", "limits"):
+                    start, delays = replace(best, kd=1.0), [0.004, 0.011, 0.018, best.delay_s, 0.6 * best.delay_s]
+                tried = {name: self.fit(start, name, delays) for name in names}
+                name = min(names, key=lambda n: self.error(tried[n]))
+                if self.error(tried[name]) > clear * self.error(best):
+                    break
+                best, clear = tried[name], 0.85
+                names.remove(name)
         return best
-
-
-def _near(name: str, value: float) -> np.ndarray:
-    if name == "delay_s":
-        return np.maximum(0.0, value + np.array([-0.006, -0.002, -0.001, 0.001, 0.002, 0.006]))
-    if name == "payload":
-        return value + np.array([-0.05, 0.05])
-    return value * np.array([0.85, 0.93, 1.07, 1.17])
 
 
 def lowest_points(model: Any, data: Any) -> list[tuple[int, np.ndarray]]:
@@ -316,13 +321,28 @@ def lowest_points(model: Any, data: Any) -> list[tuple[int, np.ndarray]]:
     return points
 
 
-_TEXTS = {
-    "kp": ("gain", "the drives are {kp:.2f} times as stiff as the contract says"),
-    "limits": ("torque limit", "torque is clipped: {clipped}"),
-    "delay_s": ("delay", "motion follows a target after {ms:.0f} ms; the training had {trained}"),
-    "friction": ("friction", "the joints have {friction:.1f} times the model's friction"),
-    "payload": ("payload", "the robot carries {payload:+.0%} of its mass beside the model's"),
-}
+@dataclass(frozen=True)
+class _Part:
+    """A parameter of the plant: the fault that it may be, and how clearly the replay must speak for it."""
+
+    fault: str
+    text: str
+    off: Callable[[Any], bool]
+    clear: float = 1.08
+
+
+_PARTS = {
+    "kp": _Part("gain", "the drives are {kp:.2f} times as stiff as the contract says",
+                lambda kp: not 0.72 <= kp <= 1.4),
+    "limits": _Part("torque limit", "torque is clipped: {clipped}", bool, 1.2),
+    "delay_s": _Part("delay", "motion follows a target after {ms:.0f} ms; the training had {trained}",
+                     lambda later_s: later_s > _LATER_S),
+    "friction": _Part("friction", "the joints have {friction:.1f} times the model's friction", lambda f: f > 3.0, 1.25),
+    "payload": _Part("payload", "the robot carries {payload:+.0%} of its mass beside the model's",
+                     lambda share: abs(share) > 0.12, 1.25),
+}  # fmt: skip
+"""Parameter -> its fault; it is one if ``off`` says so (of a delay: of what is more than in training), and the
+replay's error grows by the factor ``clear`` with the model's value."""
 
 
 def solve_plant(
@@ -334,54 +354,43 @@ def solve_plant(
         trained_delay_s: Delay of the training; default: the contract's.
     """
     replay = Replay(drives, log)
-    trained = contract.delay_s if trained_delay_s is None else trained_delay_s
     fitted = replay.fit_all()
-    nominal = replace(_NOMINAL, delay_s=fitted.delay_s)
+    trained = contract.delay_s if trained_delay_s is None else trained_delay_s
     base, best = replay.error(replace(_NOMINAL, delay_s=trained or 0.0)), replay.error(fitted)
-    age_s = 0.0 if log.rows_are_steps else _age_s(log)
+    age_s = 0.0 if log.rows_are_steps or log.age_s is None else float(np.median(log.age_s))
+    delay_s = fitted.delay_s + age_s
+    limits = np.array(fitted.limits or [np.inf] * len(contract.joints))
+    torques = limits * replay.asked
+    low = torques < _LOWER * drives.limit
+    limited = [f"{contract.joints[i]} at {torques[i]:.3g} N m" for i in np.flatnonzero(low)]
+    known_ms = "none that is known" if trained is None else f"{1e3 * trained:.0f} ms"
     findings = []
-    for name, (fault, words) in _TEXTS.items():
-        value = getattr(fitted, name)
-        if not _is_off(name, value, fitted.delay_s + age_s, trained):
+    for name, part in _PARTS.items():
+        value, usual = getattr(fitted, name), getattr(_NOMINAL, name)
+        differs = value
+        if name == "limits":
+            usual, differs = tuple(np.where(low, np.inf, limits).tolist()), limited
+        elif name == "delay_s":
+            usual, differs = max(0.0, (trained or 0.0) - age_s), delay_s - (0.010 if trained is None else trained)
+        if not part.off(differs):
             continue
         others = [n for n in ("kp", "delay_s", "kd") if n != name and getattr(fitted, n) != 1.0]
-        usual = getattr(_NOMINAL, name) if name != "delay_s" else max(0.0, (trained or 0.0) - age_s)
-        without = replay.polished(replace(fitted, **{name: usual}), others, 2)
-        factor = replay.error(without) / max(best, 1e-9)
-        if factor < (_CLEAR if name in ("kp", "limits", "delay_s") else 1.25):
+        without = replay.error(replay.polished(replace(fitted, **{name: usual}), others, 2))
+        if without < part.clear * best:
             continue
-        known = f"{1e3 * trained:.0f} ms" if trained is not None else "none that is known"
-        torques = replay.asked * fitted.limits if fitted.limits else replay.asked
-        clipped = ", ".join(
-            f"{j} at {t:.3g} N m" for j, t in zip(contract.joints, torques, strict=True) if np.isfinite(t)
-        )
-        text = words.format(ms=1e3 * (fitted.delay_s + age_s), trained=known, clipped=clipped, **vars(fitted))
-        value = value if name != "limits" else min(value)
-        share = float(np.clip((replay.error(without) - best) / max(base, best), 0.0, 1.0))
-        findings.append(Finding(fault, "timing" if name == "delay_s" else "plant", text, share, {name: float(value)}))
+        text = part.text.format(ms=1e3 * delay_s, trained=known_ms, clipped=shortened(limited), **vars(fitted))
+        share = float(np.clip((without - best) / max(base, best, 1e-9), 0.0, 1.0))
+        question, number = "timing" if name == "delay_s" else "plant", torques.min() if name == "limits" else value
+        findings.append(Finding(part.fault, question, text, share, {name: float(number)}))
+    nominal = replace(_NOMINAL, delay_s=fitted.delay_s)
     per_joint = [np.abs(replay.residuals(p)).mean((0, 1)) for p in (nominal, fitted)]
     figures = {
-        "error": base, "error_fitted": best, "delay_s": fitted.delay_s + age_s,
+        "error": base, "error_fitted": best, "delay_s": delay_s,
         **{n: getattr(fitted, n) for n in ("kp", "kd", "friction", "payload")},
         "joints": {j: [float(a), float(b)] for j, a, b in zip(contract.joints, *per_joint, strict=True)},
         "parting": parting(replay, fitted, contract.joints),
     }  # fmt: skip
     return findings, figures
-
-
-def _is_off(name: str, value: Any, delay_s: float, trained: float | None) -> bool:
-    if name == "delay_s":
-        return delay_s > (0.010 if trained is None else trained) + _LATER_S
-    if name == "kp":
-        return not _GAIN_BAND[0] <= value <= _GAIN_BAND[1]
-    if name == "limits":
-        return bool(value)
-    return value > 3.0 if name == "friction" else abs(value) > 0.12
-
-
-def _age_s(log: Log) -> float:
-    rows = np.searchsorted(log.state_t, log.t + 1e-6, side="right") - 1
-    return float(np.median(log.t - log.state_t[np.clip(rows, 0, len(log.state_t) - 1)]))
 
 
 def parting(replay: Replay, plant: Plant, joints: Sequence[str]) -> dict[str, Any]:

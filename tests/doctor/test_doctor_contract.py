@@ -3,12 +3,13 @@
 import json
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from sim2real import cli
-from sim2real.doctor.contract import Contract, Policy, Term, contract_facts, contract_toml, read_policy
+from sim2real.doctor.contract import Contract, Policy, Term, contract_toml, read_policy
 from sim2real.doctor.log import read_deployment
 from sim2real.doctor.solve import mirror_of, solve_contract
 from sim2real.errors import UsageError
@@ -91,14 +92,14 @@ def deployment(fault: str, folder: Path, logged: tuple[str, ...]) -> tuple[Polic
 )  # fmt: skip
 def test_the_fault_of_a_deployment_is_named(fault: str, logged: tuple[str, ...], tmp_path: Path) -> None:
     policy, path = deployment(fault, tmp_path, logged)
-    found, _ = solve_contract(read_deployment(path, JOINTS, 4), policy)
+    found, _ = solve_contract(read_deployment(path, JOINTS), policy)
     assert {f.fault for f in found} == ({fault} if fault else set())
     assert all(0.0 <= f.share <= 1.0 for f in found)
 
 
 def test_a_late_measurement_is_measured(tmp_path: Path) -> None:
     policy, path = deployment("delay", tmp_path, ("action", "target"))
-    found, _ = solve_contract(read_deployment(path, JOINTS, 4), policy)
+    found, _ = solve_contract(read_deployment(path, JOINTS), policy)
     assert found[0].numbers["late_s"] == pytest.approx(0.02, abs=1e-3)
 
 
@@ -107,7 +108,7 @@ def test_columns_by_name_come_in_the_contracts_order(tmp_path: Path) -> None:
     head = ["t", *(f"q.{j}_joint" for j in names), *(f"target.{j}_joint" for j in names)]
     rows = [[0.02 * i, *(k + 0.001 * i for k in range(4)), *range(10, 14)] for i in range(50)]
     (tmp_path / "log.csv").write_text("\n".join(",".join(map(str, row)) for row in (head, *rows)))
-    log = read_deployment(tmp_path / "log.csv", tuple(f"{j}_joint" for j in JOINTS), 4)
+    log = read_deployment(tmp_path / "log.csv", tuple(f"{j}_joint" for j in JOINTS))
     assert log.q[0].tolist() == [3, 2, 1, 0]
     assert log.target is not None
     assert log.target[0].tolist() == [13, 12, 11, 10]
@@ -125,7 +126,7 @@ def test_commands_of_this_projects_logs_are_no_measurements(tmp_path: Path) -> N
             at = 20_000 * i + 2_000 * k
             log.step(StepRecord(node, i, at, at, at, -1, at + 1000, 0), [v + k + 0.01 * i for v in leaves.values()])
     log.finish({})
-    read = read_deployment(tmp_path / "real.mcap", JOINTS, 4)
+    read = read_deployment(tmp_path / "real.mcap", JOINTS)
     assert read.q[10].tolist() == pytest.approx([0.1] * 4)
     assert read.target is not None
     assert read.target[10].tolist() == pytest.approx([2.1] * 4)
@@ -138,7 +139,7 @@ def test_commands_of_this_projects_logs_are_no_measurements(tmp_path: Path) -> N
 def test_a_log_without_actions_and_targets_is_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "log.npz", t=np.arange(50) / 50, q=np.zeros((50, 4)))
     with pytest.raises(UsageError, match="targets"):
-        read_deployment(tmp_path / "log.npz", JOINTS, 4)
+        read_deployment(tmp_path / "log.npz", JOINTS)
 
 
 @pytest.mark.parametrize("signal", ["obs", "command", "gyro"])
@@ -146,11 +147,11 @@ def test_rows_without_times_that_fit_nothing_are_refused(signal: str, tmp_path: 
     """One row holds for all; another number of rows says nothing about when they were."""
     log = {"t": np.arange(50) / 50, "q": np.zeros((50, 4)), "target": np.zeros((50, 4))}
     np.savez(tmp_path / "log.npz", **log, **{signal: np.ones((1, 3))})
-    held = getattr(read_deployment(tmp_path / "log.npz", JOINTS, 4), signal)
+    held = getattr(read_deployment(tmp_path / "log.npz", JOINTS), signal)
     assert held.shape == (50, 3)
     np.savez(tmp_path / "log.npz", **log, **{signal: np.ones((40, 3))})
     with pytest.raises(UsageError, match=f"{signal} has 40 rows"):
-        read_deployment(tmp_path / "log.npz", JOINTS, 4)
+        read_deployment(tmp_path / "log.npz", JOINTS)
 
 
 def test_mirrored_joints() -> None:
@@ -292,8 +293,8 @@ def test_a_foreign_policy_becomes_a_bundle(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     (tmp_path / "policy.onnx").write_bytes(network(rng))
     mean, std = rng.normal(size=CONTRACT.size), rng.uniform(0.5, 2, CONTRACT.size)
-    facts = contract_facts(CONTRACT) | {"mean": mean.tolist(), "std": std.tolist(), "clip": 5.0}
-    (tmp_path / "c.toml").write_text(contract_toml(facts, {}))
+    normalised = msgspec.structs.replace(CONTRACT, mean=tuple(mean.tolist()), std=tuple(std.tolist()), clip=5.0)
+    (tmp_path / "c.toml").write_text(contract_toml(normalised))
     flags = ["--policy", str(tmp_path / "policy.onnx"), "--contract", str(tmp_path / "c.toml")]
     assert cli.main(["doctor", *flags, "--bundle", str(tmp_path / "b"), "--out", str(tmp_path)]) == 0
     policy, x = read_policy(tmp_path / "policy.onnx", tmp_path / "c.toml"), rng.normal(size=(5, CONTRACT.size))
@@ -308,6 +309,6 @@ def test_no_onnx_and_wrong_sizes_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="ONNX"):
         read_policy(tmp_path / "policy.onnx")
     (tmp_path / "policy.onnx").write_bytes(network(np.random.default_rng(0), 11))
-    (tmp_path / "c.toml").write_text(contract_toml(contract_facts(CONTRACT), {}))
+    (tmp_path / "c.toml").write_text(contract_toml(CONTRACT))
     with pytest.raises(UsageError, match="11 numbers"):
         read_policy(tmp_path / "policy.onnx", tmp_path / "c.toml")

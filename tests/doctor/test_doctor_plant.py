@@ -10,10 +10,11 @@ from test_doctor_contract import network
 
 from sim2real import cli
 from sim2real.doctor import before, plant
-from sim2real.doctor.contract import Contract, Term, contract_facts, contract_toml
+from sim2real.doctor.contract import Contract, Term, contract_toml
+from sim2real.doctor.diagnosis import solve_timing
 from sim2real.doctor.log import read_deployment
 from sim2real.doctor.plant import Drives, driven_joints, solve_plant
-from sim2real.doctor.timing import solve_timing
+from sim2real.doctor.solve import shortened
 
 XML = """<mujoco><option timestep="0.0025"/><worldbody><body>
 <joint name="a" axis="0 1 0" damping="0.01" armature="0.003"/>
@@ -62,7 +63,7 @@ def recorded(folder: Path, kp: float = 1.0, limit: float = 1e6, delay_s: float =
     ids=["sound", "gain", "limit", "delay"],
 )
 def test_the_fault_of_a_plant_is_named(setting: dict[str, float], fault: str, tmp_path: Path) -> None:
-    log = read_deployment(recorded(tmp_path, **setting), CONTRACT.joints, 2)
+    log = read_deployment(recorded(tmp_path, **setting), CONTRACT.joints)
     found, figures = solve_plant(Drives(tmp_path / "robot.xml", CONTRACT), log, CONTRACT)
     assert [f.fault for f in found] == ([fault] if fault else [])
     assert figures["error_fitted"] <= figures["error"]
@@ -72,8 +73,20 @@ def test_the_fault_of_a_plant_is_named(setting: dict[str, float], fault: str, tm
         assert figures["delay_s"] == pytest.approx(0.035, abs=0.005)
 
 
+def test_torque_at_the_limit_of_the_model_is_no_fault(tmp_path: Path) -> None:
+    log = read_deployment(recorded(tmp_path, limit=1.0), CONTRACT.joints)
+    (tmp_path / "robot.xml").write_text(XML.replace("armature", 'actuatorfrcrange="-1.1 1.1" armature'))
+    found, _ = solve_plant(Drives(tmp_path / "robot.xml", CONTRACT), log, CONTRACT)
+    assert found == []
+
+
+def test_a_sentence_about_many_joints_names_two() -> None:
+    assert shortened(["a at 1 N m", "b at 2 N m"]) == "a at 1 N m, b at 2 N m"
+    assert shortened(list("abcdefghij")) == "a, b and 8 more"
+
+
 def test_another_rate_is_named(tmp_path: Path) -> None:
-    log = read_deployment(recorded(tmp_path, rate=40.0), CONTRACT.joints, 2)
+    log = read_deployment(recorded(tmp_path, rate=40.0), CONTRACT.joints)
     found, figures = solve_timing(log, CONTRACT)
     assert [f.fault for f in found] == ["rate"]
     assert figures["rate_hz"] == pytest.approx(40.0)
@@ -82,7 +95,7 @@ def test_another_rate_is_named(tmp_path: Path) -> None:
 def files(folder: Path) -> list[str]:
     contract = Contract(50.0, ("a", "b", "c", "d"), 0.0, 0.1, (Term("joint_pos"), Term("joint_vel")), 8.0, 0.3)
     (folder / "policy.onnx").write_bytes(network(np.random.default_rng(0), 8))
-    (folder / "contract.toml").write_text(contract_toml(contract_facts(contract), {}))
+    (folder / "contract.toml").write_text(contract_toml(contract))
     chain = "".join(f'<body pos="0 0 -0.1"><joint name="{j}" axis="0 1 0" damping="0.05"/>'
                     '<geom size="0.02" mass="0.1" contype="0" conaffinity="0"/>' for j in contract.joints)  # fmt: skip
     (folder / "robot.xml").write_text(f"<mujoco><worldbody>{chain}{'</body>' * 4}</worldbody></mujoco>")
