@@ -91,6 +91,7 @@ def test_constants_truth_values_and_stacked_columns(tmp_path):
         "kp": {"source": "meta.kp"},
         "enabled": {"source": "entries[].on"},
         "q": {"source": ["entries[].state.q[:,1]", "entries[].u"]},
+        "one": {"source": ["entries[].u"]},
     }
     tables = {"pipeline": "rig", "nodes": {"actuator": {"stamps": "entries[].t", "fields": fields}}}
     episode = import_file(foreign_files.records(tmp_path / "run.json"), ImportMapping.from_dict(tables))
@@ -98,6 +99,7 @@ def test_constants_truth_values_and_stacked_columns(tmp_path):
     np.testing.assert_array_equal(commands["kp"], np.full(COUNT, 7.0))
     np.testing.assert_array_equal(commands["enabled"], np.arange(COUNT) % 2)
     np.testing.assert_array_equal(commands["q"], np.stack([Q[:, 1], U], axis=1))
+    np.testing.assert_array_equal(commands["one"], U[:, None])
     np.testing.assert_array_equal(episode.steps["actuator"].start, STAMPS_US)
     assert {values.dtype for values in commands.values()} == {np.dtype(float)}
 

@@ -232,7 +232,7 @@ def _field(table: Table, node: str, field: str, how: FieldMapping) -> np.ndarray
                     hint="decode them as signed (two's complement, or a sign bit) before the import",
                 )
     try:
-        raw = parts[0] if len(parts) == 1 else np.stack(np.broadcast_arrays(*parts), axis=-1)
+        raw = parts[0] if isinstance(how.source, str) else np.stack(np.broadcast_arrays(*parts), axis=-1)
     except ValueError:
         shapes = ", ".join(f"{source} {part.shape}" for source, part in zip(how.sources, parts, strict=True))
         raise UsageError(

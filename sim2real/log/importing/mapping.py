@@ -47,7 +47,7 @@ class FieldMapping(_Table, frozen=True):
     """The source of a field of a node's output.
 
     Attributes:
-        source: Name of a signal in the file, or several, which are stacked; ``q[:,0]`` is a column of an array.
+        source: Name of a signal in the file, or a list of names for a vector; ``q[:,0]`` is a column of an array.
         unit: Unit of the field after scaling; degrees, turns and counts are converted to radians, mm to m.
         scale: The field is ``scale * signal + offset``; one number, or one for each column.
         offset: See ``scale`` [the field's unit]; one number, or one for each column.

@@ -250,7 +250,7 @@ class Signal:
 
     def mapped(self, unit: str, **more: Any) -> FieldMapping:
         """Return the field that has these columns."""
-        return FieldMapping(self.whole or self.sources, unit, shape=(-1,), **more)
+        return FieldMapping(self.whole or self.sources, unit, **more)
 
 
 def collect(table: Table) -> tuple[list[Signal], list[str]]:

@@ -416,8 +416,9 @@ class Proposal:
             if not np.nan_to_num(chosen.values).any() and not name.startswith("payload"):
                 self.evidence.append(f"{chosen.name!r} is 0 throughout: omitted")
                 continue
-            source = chosen.whole or (chosen.sources if chosen.width > 1 else chosen.sources[0])
-            fields["actuator"][name] = FieldMapping(source, unit, shape=(-1,))
+            is_constant = chosen.values.ndim == 1
+            source = chosen.sources[0] if is_constant and chosen.width == 1 else chosen.whole or chosen.sources
+            fields["actuator"][name] = FieldMapping(source, unit, shape=(-1,) if is_constant else None)
             self.reasons["actuator", name, "source"] = "by its name"
 
     def add_velocities(
