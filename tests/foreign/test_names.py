@@ -207,7 +207,8 @@ def test_which_of_two_commands_is_asked(tmp_path):
     other = {"command_a_rad": GOAL[::-1, 0], "command_b_rad": GOAL[::-1, 1]}
     path = table(tmp_path)
     episode = csv(path, {"t_s": T, "goal_rad": GOAL[:, 0], "target_rad": GOAL[::-1, 0], "q_rad": Q[:, 0], **other})
-    assert ("actuator", "goal", "source") in proposed(episode).questions
+    question = proposed(episode).questions["actuator", "goal", "source"]
+    assert question.startswith('["goal_rad"] or ["target_rad"]')
 
 
 @pytest.mark.parametrize(

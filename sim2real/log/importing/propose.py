@@ -178,13 +178,12 @@ class Proposal:
                 f"{'; '.join([', '.join(self.table.keys[:40]) or 'none', *self.evidence[:5]])}",
                 hint="name them by quantity and joint, such as q_hip_rad and goal_hip_rad, or write a mapping",
             )
-        several = [f'"{s.whole}"' if s.whole else json.dumps(s.sources[:1])[:-1] + ", ...]" for s in choices[:12]]
         at, what = (
             (("sensor", "position", "source"), "which are the measured positions")
             if side == "measured"
             else (("actuator", "goal", "source"), "which commands drove the joints")
         )
-        self.questions[at] = f"{' or '.join(several)}?  # {what}: names do not say"
+        self.questions[at] = f"{' or '.join(map(_written, choices[:12]))}?  # {what}: names do not say"
         return choices[0]
 
     def joint_order(self, measured: Signal) -> tuple[list[int], tuple[str, ...]]:
@@ -548,6 +547,13 @@ def _rank(named: Meaning, side: str) -> int | None:
     if named.side == "command" and named.quantity in _FIELDS:
         return 2
     return {"duty": 3, "voltage": 3, "torque": 4}.get(named.quantity) if not named.side else None
+
+
+def _written(signal: Signal) -> str:
+    """Return the source of a signal as a mapping file has it, shortened."""
+    if signal.whole or signal.width == 1:
+        return json.dumps(signal.whole or signal.sources)
+    return json.dumps(signal.sources[:1])[:-1] + ", ...]"
 
 
 def _in_order(signal: Signal, measured: Signal, places: Sequence[int]) -> Signal | None:
