@@ -8,13 +8,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sim2real.artifacts.progress import BEST_FIT, PROGRESS, write_best_fit, write_progress
+from sim2real.artifacts.progress import PROGRESS, write_progress
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode, Steps
 from sim2real.stages import live
-from sim2real.view.live.follower import Follower
+from sim2real.view.live.follower import Follower, ProgressSource
 from sim2real.view.live.log_source import LogSource, _thinned
-from sim2real.view.live.stage_sources import FitSource, ProgressSource
 from sim2real.view.model_scene import ModelScene
 
 rr = pytest.importorskip("rerun")
@@ -81,27 +80,6 @@ def test_curves_grow_by_whole_lines(tmp_path):
     second = source.read()
     assert second.plots["return"][0].values.tolist() == [3.0]
     assert math.isnan(second.plots["return"][1].values[0])
-
-
-def fit(offset):
-    t_s = np.linspace(0.0, 4.0, 100)
-    columns = {"t": t_s, "segment": (t_s > 2.0).astype(int), "recording": np.zeros(100, int)}
-    return {**columns, "th_measured": np.sin(t_s), "th_identified": np.sin(t_s) + offset}
-
-
-def test_each_better_fit_replaces_the_one_before(tmp_path):
-    source = FitSource(tmp_path / BEST_FIT, "identify/fit")
-    write_best_fit(tmp_path, fit(0.3))
-    first = source.read()
-    assert source.read() is None
-    write_best_fit(tmp_path, fit(0.1))
-    second = source.read()
-    (a, b), (c, d) = first.plots["th"], second.plots["th"]
-    assert a.entity == c.entity
-    assert b.entity != d.entity
-    assert np.nanmax(np.abs(d.values - c.values)) == pytest.approx(0.1)
-    assert np.isnan(d.values).sum() == 1, "between the segments"
-    assert [p.name for p in tmp_path.iterdir()] == [BEST_FIT], "no part is left behind"
 
 
 def test_a_follower_sends_each_row_once_and_what_stands_still_once(tmp_path):

@@ -39,7 +39,7 @@ class IdentifyConfig(FitConfig):
     """Parts that are held out of a refit, one at a time, to measure errors on new data: each of several logs, or this
     many blocks of a single log; 0 skips the refits."""
     view: ViewFlag = None
-    """Show the best fit so far over the recording in the Rerun viewer while the search runs; 'web': for browsers."""
+    """Show the loss in the Rerun viewer while the search runs; 'web': for browsers."""
     terms: str = "own"
     """Optional terms: 'own' (the pipeline's, and one that halves the errors on held-out parts), 'auto' (chosen on
     held-out parts), 'all', 'none', or names separated by commas."""

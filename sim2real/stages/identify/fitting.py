@@ -103,7 +103,6 @@ def _fitted(inputs: Inputs, best: Best, title: str, end: np.ndarray | None = Non
         note(f"engine: {problem.engine}")
         if (few := len(problem.train)) < (every := sum(span.fitted for span in inputs.windows)):
             note(f"the fit takes {few} of {every} segments, those with most motion of each log; all are predicted")
-        best.begin(problem)
 
     best.restart(inputs.table)
     with _progress(title, best) as report:

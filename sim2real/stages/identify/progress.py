@@ -1,12 +1,11 @@
 """The course of a fit: its best values so far, and the files that show and keep them.
 
-``progress.jsonl`` and ``best_fit.npz`` are for a viewer that joins the search. ``partial.json`` has the fitted values
+``progress.jsonl`` is for a viewer that joins the search. ``partial.json`` has the fitted values
 while they are judged; it stays if a signal or an error ends the stage before the verdict.
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -15,19 +14,15 @@ from pathlib import Path
 import numpy as np
 
 from sim2real.artifacts.identification import Estimate, Identification, Judgement, Search
-from sim2real.artifacts.progress import write_best_fit, write_progress
+from sim2real.artifacts.progress import write_progress
 from sim2real.artifacts.run import OpenStage
 from sim2real.identification.fit import as_numbers
 from sim2real.identification.parameters import ParameterTable
-from sim2real.identification.predictions import samples
-from sim2real.identification.problem import Problem
 from sim2real.stages.identify.inputs import Inputs
 from sim2real.stages.live import live_view
 from sim2real.stages.terminal.console import note, shown
 
 PARTIAL = "partial.json"
-_PERIOD_S = 5.0
-"""Least time between two best fits: each is a simulation of all segments [s]."""
 
 
 @dataclass
@@ -52,9 +47,6 @@ class Best:
     loss: float = np.inf
     done: dict[str, float] = field(default_factory=dict)
     ended: bool = False
-    _problem: Problem | None = None
-    _shown: float = np.inf
-    _next_s: float = 0.0
 
     def __post_init__(self) -> None:
         self.restart(self.table)
@@ -62,10 +54,6 @@ class Best:
     def restart(self, table: ParameterTable) -> None:
         """Begin a search of other parameters."""
         self.table, self.z, self.loss, self.done = table, None, np.inf, {"search": 0.0, "refine": 0.0}
-
-    def begin(self, problem: Problem) -> None:
-        """Take the problem of the next search."""
-        self._problem, self._shown = problem, np.inf
 
     def advance(self, stage: str, share: float, loss: float, z: np.ndarray) -> None:
         """Record progress; the first result of a refinement replaces that of the search, even with a larger loss.
@@ -85,13 +73,7 @@ class Best:
         self.done[stage] = min(1.0, self.done[stage] + share)
         if self.folder is None or self.inputs is None or self.z is None or not np.isfinite(self.loss):
             return
-        # A viewer shows the loss, and the best fit if it is better than the one before.
         write_progress(self.folder, {"loss": self.loss})
-        config, problem, now_s = self.inputs.config, self._problem, time.monotonic()
-        if config.view is not None and problem is not None and self.loss < self._shown and now_s >= self._next_s:
-            values = {"identified": problem.table.decode(self.z)}
-            write_best_fit(self.folder, samples(problem, values, config.settle_s))
-            self._shown, self._next_s = self.loss, time.monotonic() + _PERIOD_S
 
     def fitted(self, z: np.ndarray, loss: float) -> None:
         """Record the finished fit, which is written before the longer judgement begins.

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
 
-from sim2real.artifacts.progress import BEST_FIT, PROGRESS
+import numpy as np
+
+from sim2real.artifacts.progress import PROGRESS
 from sim2real.view.live.log_source import LogSource
-from sim2real.view.live.stage_sources import FitSource, ProgressSource
-from sim2real.view.rerun_content import Tab
+from sim2real.view.rerun_content import Curve, Tab
 from sim2real.view.rerun_recording import Scene, blueprint_of, send_style, send_values, time_column
 
 PERIOD_S = 0.2
@@ -70,9 +73,7 @@ class Follower:
         folder = path.parent.name
         if path.suffix == ".mcap":
             return LogSource(path, f"{folder}/{path.stem}", self._offset_s)
-        if path.name == PROGRESS:
-            return ProgressSource(path, f"{folder}/curves", self._offset_s)
-        return FitSource(path, f"{folder}/fit") if path.name == BEST_FIT else None
+        return ProgressSource(path, f"{folder}/curves", self._offset_s) if path.name == PROGRESS else None
 
     def _send(self, path: Path, tab: Tab) -> None:
         # Arrange the viewer for a tab with new curves.
@@ -125,3 +126,37 @@ class _StaticOnce:
     def send_columns(self, *arguments: Any) -> None:
         """Send columns."""
         self._recording.send_columns(*arguments)
+
+
+class ProgressSource:
+    """The new points of a stage's curves, as a tab with a plot for each name.
+
+    Args:
+        path: The file, see ``artifacts.progress``.
+        entity: Prefix of its entities.
+        offset_s: Returns the place of a wall clock's time [ns] on the live view's timeline [s].
+    """
+
+    def __init__(self, path: Path, entity: str, offset_s: Callable[[int], float]) -> None:
+        self._path, self._entity, self._offset_s, self._read = path, entity, offset_s, 0
+
+    def read(self) -> Tab | None:
+        """Return a tab with the points since the last call; None if there are none."""
+        # Take whole lines; the last one may still be growing.
+        with open(self._path, "rb") as stream:
+            stream.seek(self._read)
+            data = stream.read()
+        data = data[: data.rfind(b"\n") + 1]
+        self._read += len(data)
+        points = [json.loads(line) for line in data.splitlines()]
+        if not points:
+            return None
+        plots: dict[str, list[Curve]] = {}
+        for name, first in points[0]["values"].items():
+            some = [p for p in points if name in p["values"]]
+            t_s = np.array([self._offset_s(p["epoch_ns"]) for p in some])
+            for seed in range(len(first)):
+                label = name if len(first) == 1 else f"seed {seed}"
+                values = np.array([p["values"][name][seed] for p in some], np.float64)
+                plots.setdefault(name, []).append(Curve(f"{self._entity}/{name}/{seed}", label, "", t_s, values))
+        return Tab(self._entity, self._entity, plots, [], recent_s=math.inf)
