@@ -39,7 +39,7 @@ fields.th = { source = "q[:,0]", unit = "rad" }
 
 def npz(path: Path, **changes: object) -> Path:
     """Write the signals as arrays; None leaves one out."""
-    signals = {"t": STAMPS_US / 1e6, "u": U, "q": Q, "kp": np.float64(7.0), "rate": 50.0, **changes}
+    signals = {"t": STAMPS_US / 1e6, "u": U, "q": Q, "kp": np.float64(7.0), **changes}
     np.savez(path, **{name: value for name, value in signals.items() if value is not None})
     return path
 

@@ -35,14 +35,12 @@ class _Stream:
     Attributes:
         fields: Field -> values in the log's unit, shape ``(N, ...)``, or ``()`` for a constant.
         stamps: Shape ``(N,)``, as recorded; None without any.
-        rate_hz: Rate from which stamps are generated [Hz]; None with recorded stamps.
         rows: The numbers of the selected samples in the file.
         dropped: Policy -> number of samples that it dropped.
     """
 
     fields: dict[str, np.ndarray]
     stamps: np.ndarray | None
-    rate_hz: float | None
     rows: np.ndarray
     dropped: Counter[str]
 
@@ -192,15 +190,6 @@ def _stream(table: Table, name: str, node: NodeMapping) -> _Stream:
             f"stamps {node.stamps!r} in {table.path} have the shape {stamps.shape}, expected (N,)",
             hint=f'choose a column, such as stamps = "{node.stamps}[:,0]"',
         )
-    rate_hz = node.rate_hz
-    if isinstance(rate_hz, str):
-        rate = table.signal(rate_hz)
-        if rate.ndim or not 0.0 < rate < np.inf:
-            raise UsageError(
-                f"rate_hz of node {name!r} is {rate_hz!r}, which is {rate if not rate.ndim else rate.shape}",
-                hint="a rate is one number above 0; if the signal has the stamps, write stamps instead of rate_hz",
-            )
-        rate_hz = float(rate)
     # All signals of a node need one length.
     lengths = {field: len(values) for field, values in fields.items() if values.ndim}
     if stamps is not None:
@@ -216,7 +205,7 @@ def _stream(table: Table, name: str, node: NodeMapping) -> _Stream:
     count = next(iter(lengths.values()))
     if not count:
         raise UsageError(f"node {name!r} has no samples in {table.path}", hint="check that the file is complete")
-    return _Stream(fields, stamps, rate_hz, np.arange(count), Counter())
+    return _Stream(fields, stamps, np.arange(count), Counter())
 
 
 def _field(table: Table, node: str, field: str, how: FieldMapping) -> np.ndarray:
@@ -303,7 +292,7 @@ def _plausible(table: Table, name: str, field: str, node: NodeMapping, own: _Str
             change faster than a joint can move.
     """
     what, values = f"field {field} of node {name} in {table.path}", own.fields[field]
-    t_s = own.rows / (own.rate_hz or 1.0)
+    t_s = own.rows / (node.rate_hz or 1.0)
     if own.stamps is not None:
         t_s = own.stamps[own.rows] * (STAMP_UNITS[node.stamp_unit] * 1e-9)
     if not values.ndim or len(own.rows) < 3 or not (np.isfinite(t_s).all() and (np.diff(t_s) > 0).all()):
@@ -355,7 +344,7 @@ def _ticks(table: Table, name: str, node: NodeMapping, own: _Stream) -> np.ndarr
     """Return the stamps of the selected samples, shape ``(N,)``, int64 [us]."""
     if own.stamps is None:
         # Use the slots of the timing rules for a node of this rate.
-        return np.floor((own.rows - own.rows[:1]) * 1e6 / (own.rate_hz or 1.0) + 0.5).astype(np.int64)
+        return np.floor((own.rows - own.rows[:1]) * 1e6 / (node.rate_hz or 1.0) + 0.5).astype(np.int64)
     stamps = own.stamps[own.rows]
     what = f"stamps {node.stamps!r} of node {name!r}"
     hint = f"stamp_unit is {node.stamp_unit!r}; available: {', '.join(STAMP_UNITS)}"

@@ -93,7 +93,7 @@ class NodeMapping(_Table, frozen=True):
 
     Attributes:
         fields: Field -> its source.
-        rate_hz: Rate of generated time stamps [Hz], or the name of a signal with the rate; None: use ``stamps``.
+        rate_hz: Rate of generated time stamps [Hz]; None: use ``stamps``.
         stamps: Signal with the recorded time stamps; None: use ``rate_hz``.
         stamp_unit: Unit of the recorded stamps.
         order: Order of messages with equal stamps: those of nodes with a lower number are first; None: commands
@@ -105,7 +105,7 @@ class NodeMapping(_Table, frozen=True):
     """
 
     fields: Mapping[str, FieldMapping]
-    rate_hz: float | str | None = None
+    rate_hz: float | None = None
     stamps: str | None = None
     stamp_unit: Literal["s", "ms", "us", "ns"] = "s"
     order: int | None = None
@@ -119,7 +119,7 @@ class NodeMapping(_Table, frozen=True):
             raise ValueError("a node has fields: fields.NAME = { source = ... }")
         if (self.rate_hz is None) == (self.stamps is None):
             raise ValueError("a node has either 'stamps', which are recorded, or 'rate_hz', which generates them")
-        if isinstance(self.rate_hz, float) and not 0.0 < self.rate_hz < math.inf:
+        if self.rate_hz is not None and not 0.0 < self.rate_hz < math.inf:
             raise ValueError(f"rate_hz must be above 0, in samples per second, got {self.rate_hz}")
         if not math.isfinite(self.stamp_offset) or (self.stamp_offset and self.stamps is None):
             raise ValueError("stamp_offset is a finite number [s], added to recorded stamps")
