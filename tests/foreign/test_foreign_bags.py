@@ -1,10 +1,12 @@
 """Bags of other people's robots: each row is a bag, and beside it what the import must make of it."""
 
 import contextlib
+import functools
 import gzip
 import json
 import struct
 
+import foreign_robots
 import made_bags as bags
 import numpy as np
 import pytest
@@ -16,20 +18,12 @@ from sim2real import cli
 from sim2real.errors import UsageError
 from sim2real.log import McapRecorder, read_log
 from sim2real.log.importing.bags import is_ours
-from sim2real.log.importing.importer import import_table
 from sim2real.log.importing.propose import ImportHints, propose
 from sim2real.log.importing.readers import open_tables
 
 SET_S = 402_500_000
+imported = functools.partial(foreign_robots.imported, joints=("a", "b"))
 IDENTITY = lambda k, ns: ns  # noqa: E731
-
-
-def imported(path, joints=("a", "b")):
-    """Return the episode that a bag becomes without a mapping, and the proposal."""
-    (table,) = open_tables(path)
-    found = propose(table, ImportHints("rig", joints=joints))
-    assert found.questions == {}
-    return import_table(table, found.mapping), found
 
 
 def is_right(episode, q=Q, goal=GOAL, start_ns=STAMPS_NS):

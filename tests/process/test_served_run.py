@@ -1,4 +1,4 @@
-"""A search streams its best fit, a training its curves; ``report --rerun --follow`` joins, ``--rerun web`` serves."""
+"""``report --rerun web`` serves a run to browsers; ``--follow`` joins one that goes on."""
 
 import contextlib
 import os
