@@ -16,7 +16,8 @@ RESPONSE_S: Final = 0.2
 SLOW_RAD_S: Final = 0.5
 """Speed that every servo reaches on a longer way, also under load [rad/s]."""
 MOST_SHARE: Final = 0.9
-"""Share of its torque beyond which a servo that still does not reach its goal is stopped."""
+"""Share of its torque beyond which a servo that still does not reach its goal is stopped. With 0.7, 6 of 45 sound
+motions of an emulated SO-101 with payloads were stopped."""
 _BEYOND_S: Final = 0.04
 """Time for which a joint must be beyond its limit before the robot is stopped [s]."""
 _SAMPLES: Final = 3
