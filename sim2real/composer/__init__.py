@@ -25,7 +25,7 @@ from sim2real.composer.initializer import Initializer as Initializer
 from sim2real.composer.mjcf.model import RootElement
 from sim2real.composer.observables import Observables as Observables
 from sim2real.composer.physics.c.physics import Physics as Physics
-from sim2real.composer.prop_placer import PropPlacer as PropPlacer
+from sim2real.composer.placing import PropPlacer as PropPlacer
 from sim2real.composer.robot import SENSOR_SITES_GROUP as SENSOR_SITES_GROUP
 from sim2real.composer.robot import Robot as Robot
 from sim2real.composer.task import NullTask as NullTask

@@ -350,14 +350,7 @@ class MjxEnvironment:
 
     def select(self, condition: jax.Array, a: State, b: State) -> State:
         """Return copy ``a`` where the condition holds, else copy ``b``; e.g. to reset copies that are done."""
-
-        def choose(x: jax.Array, y: jax.Array) -> jax.Array:
-            if not jnp.issubdtype(jnp.asarray(x).dtype, jax.dtypes.prng_key):
-                return jnp.where(condition, x, y)
-            data = jnp.where(condition, jax.random.key_data(x), jax.random.key_data(y))
-            return jax.random.wrap_key_data(data, impl=jax.random.key_impl(x))
-
-        return jax.tree_util.tree_map(choose, a, b)
+        return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)
 
 
 def _initial_data(model: MjModel) -> mjx.Data:

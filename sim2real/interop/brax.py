@@ -13,6 +13,7 @@ from sim2real.composer.mjx_environment import MjxEnvironment
 from sim2real.errors import Sim2RealError
 from sim2real.installation import with_extra
 from sim2real.interop.robot import RobotEnvironment, specs_of
+from sim2real.training.environment.protocol import to_vector
 
 try:
     from brax.envs.base import Env
@@ -97,7 +98,7 @@ class BraxEnv(Env):
         info["key"], key = jax.random.split(info["key"])
         if _FIRST_STATE in info:
             fresh = self.environment.reset(key)
-            info |= {_FIRST_STATE: fresh, _FIRST_OBSERVATION: _vector(fresh)}
+            info |= {_FIRST_STATE: fresh, _FIRST_OBSERVATION: to_vector(fresh.observation)}
         if self._middle is not None:
             action = self._middle + self._half * jnp.clip(action, -1.0, 1.0)
         copy = self.environment.step(before, action)
@@ -116,12 +117,4 @@ def _brax_state(
     info |= {n: getattr(copy, n).astype(dtype) for n in ("discount", "failed") if hasattr(copy, n)}
     of_episode = getattr(copy, "values", {})  # brax's wrappers add metrics of their own, which stay
     metrics = metrics | {n: jnp.where(copy.done, v, 0.0) for n, v in of_episode.items()}
-    return BraxState(copy, _vector(copy), reward, done.astype(dtype), metrics, info)
-
-
-def _vector(copy: PyTree) -> jax.Array:
-    """Return an observation as one vector."""
-    observation = copy.observation
-    if not isinstance(observation, dict):
-        return observation
-    return jnp.concatenate([jnp.ravel(value) for value in observation.values()])
+    return BraxState(copy, to_vector(copy.observation), reward, done.astype(dtype), metrics, info)

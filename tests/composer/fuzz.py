@@ -2,9 +2,8 @@
 
 ``python tests/composer/fuzz.py 0 200`` plays the tasks of seeds 0 to 199, two episodes of each, on dm_control and on C,
 with tendons, pairs, equalities, actuators and sensors across models, whose elements change their names afterwards. With
-``--engine mjx`` it plays them on C and on MJX, without welds and distances, from the same random numbers; with
-``--engine bare`` on MJX and with ``mjx.step`` alone; hooks then only set controls. ``--contacts same`` has contacts
-that MJX finds as C does, ``--contacts all`` any; ``--jobs`` is how many processes there are.
+``--engine mjx`` it plays them on C and on MJX, without welds and distances, from the same random numbers.
+``--contacts same`` has contacts that MJX finds as C does, ``--contacts all`` any; ``--jobs``: number of processes.
 """
 
 import argparse
@@ -161,38 +160,9 @@ def differ(a, b):
     return worst
 
 
-def against_bare(seed, contacts):
-    """Return how far a task whose hooks only set the controls is from ``mjx.step`` alone on MJX."""
-    import jax
-    from mujoco import mjx
-
-    ours = kit("sim2real")
-    task, options = make(ours, seed, contacts, busy=False)
-    env = ours.composer.MjxEnvironment(task, **options)
-    start = jax.jit(env.reset)(jax.random.key(0))
-
-    def bare(data, action):
-        data, _ = jax.lax.scan(
-            lambda d, _: (mjx.step(env.mjx_model, d), None), data.replace(ctrl=action), length=env.substeps
-        )
-        return data, (data.qpos, data.qvel, data.act)
-
-    def mine(state, action):
-        state = env.step(state, action)
-        return state, (state.data.qpos, state.data.qvel, state.data.act)
-
-    actions = _actions(seed, env.model.nu)
-    both = [
-        jax.jit(lambda s, a, f=f: jax.lax.scan(f, s, a)[1])(s, actions) for f, s in ((bare, start.data), (mine, start))
-    ]
-    return differ(*([list(np.concatenate(streams, axis=1)), [], [], False] for streams in both))
-
-
 def compare(seed, contacts=None, engine="dm_control"):
     """Return the greatest deviation between what an engine and ours on C make of a task, and where it is."""
     ours = kit("sim2real")
-    if engine == "bare":
-        return against_bare(seed, contacts)
     if engine == "mjx":
         mine = play_on_mjx(seed, contacts, True, (0, 1), linked="mjx")
         return max(differ(play(ours, seed, contacts, True, key, linked="mjx"), m) for key, m in enumerate(mine))
@@ -216,7 +186,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("first", type=int)
     parser.add_argument("count", type=int)
-    parser.add_argument("--engine", choices=["dm_control", "mjx", "bare"], default="dm_control")
+    parser.add_argument("--engine", choices=["dm_control", "mjx"], default="dm_control")
     parser.add_argument("--contacts", choices=["same", "all"])
     parser.add_argument("--jobs", type=int, default=1)
     args = parser.parse_args()

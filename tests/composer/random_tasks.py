@@ -340,7 +340,7 @@ def _world(kit, draw, contacts, operator, seed=None, for_mjx=False):
     return arena, entities, {**found, "mocap": mocap}, operations
 
 
-def make(kit, seed, contacts=None, varied=False, numbers=0, busy=True, linked=False):
+def make(kit, seed, contacts=None, varied=False, numbers=0, linked=False):
     """Return the task of a seed and options of its environment.
 
     Args:
@@ -350,7 +350,6 @@ def make(kit, seed, contacts=None, varied=False, numbers=0, busy=True, linked=Fa
         varied: Whether delays and intervals of observables vary from sample to sample, where dm_control shifts samples,
             and nothing is varied that is also set otherwise, which MJX starts from another value.
         numbers: Seed of the numbers in the model.
-        busy: Whether hooks do more than set the controls.
         linked: Whether there are elements that name elements of other models; "mjx": those that MJX has as C does.
     """
     draw, operator = Draw(seed, numbers), Operator(kit)
@@ -358,14 +357,14 @@ def make(kit, seed, contacts=None, varied=False, numbers=0, busy=True, linked=Fa
         kit, draw, contacts, operator, seed if linked else None, linked == "mjx"
     )
     for own in operations[: len(entities)]:
-        own.update(_operations(draw, found, 1 if busy else 0))
+        own.update(_operations(draw, found, 1))
     observables = {f"o{i}": _observable(kit, draw, found, varied) for i in range(draw.kinds.randint(2, 6))}
     for i, name in enumerate(sorted(observables)):
         observables[name].enabled = True
         if i % 3 == 1:
             entities[0].observables.add_observable(name, observables.pop(name))
     of_task, once, often = (
-        _operations(draw, found, 2 if busy else 0),
+        _operations(draw, found, 2),
         kit.variation.PhysicsVariator(),
         kit.variation.PhysicsVariator(),
     )
@@ -374,9 +373,9 @@ def make(kit, seed, contacts=None, varied=False, numbers=0, busy=True, linked=Fa
     ]
     for name, variator in (("once", once), ("often", often)):  # on MJX what varies starts from the compiled value
         taken = written if varied else []
-        setattr(operator, name, (variator, busy and _bind(kit, draw, variator, found, taken)))
+        setattr(operator, name, (variator, _bind(kit, draw, variator, found, taken)))
     before = kit.variation.MJCFVariator()
-    if busy and draw.chance(0.4):
+    if draw.chance(0.4):
         before.bind_attributes(draw.pick(found["geom"]), density=kit.distributions.Uniform(500.0, 2000.0))
     limit, binds = draw.pick([None, None, 30.0, 300.0]), draw.chance(0.5)
     hooks = _hooks(kit, draw, operator, of_task, before, found["actuator"] if binds else [])

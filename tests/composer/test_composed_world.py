@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from brax.envs.wrappers.training import AutoResetWrapper, EpisodeWrapper
 from flax import struct
 
 from sim2real import composer
@@ -179,42 +178,6 @@ def environment():
     return composer.MjxEnvironment(Push(start=0.1), time_limit=0.2)
 
 
-@pytest.mark.night
-def test_brax_runs_the_task_with_its_own_wrappers(environment):
-    env = composer.BraxEnv(environment)
-    assert (env.observation_size, env.action_size, env.backend, env.dt) == (3, 1, "mjx", 0.02)
-    wrapped = AutoResetWrapper(EpisodeWrapper(env, episode_length=env.max_episode_length, action_repeat=1))
-
-    def run(key):
-        def step(state, _):
-            state = wrapped.step(state, jnp.ones(1))
-            return state, (state.done, state.info["truncation"], state.obs)
-
-        state = wrapped.reset(key)
-        return state.obs, jax.lax.scan(step, state, length=25)[1]
-
-    first, (done, truncation, observations) = jax.jit(jax.vmap(run))(jax.random.split(jax.random.key(0), 3))
-    assert first.shape == (3, 3)
-    assert [np.flatnonzero(d).tolist() for d in np.asarray(done)] == [[9, 19]] * 3
-    np.testing.assert_array_equal(truncation, done)  # brax's learners go by this: a time limit is no failure
-    starts = np.stack([first, observations[:, 9], observations[:, 19]])[..., 2]
-    assert len(np.unique(starts)) == 9  # every episode of every copy starts somewhere else
-    assert (np.asarray(observations)[:, 8, 2] > np.asarray(first)[:, 2]).all()
-
-
-@pytest.mark.night
-def test_brax_s_wrapper_must_not_go_on_past_the_time_limit(environment):
-    wrapped = EpisodeWrapper(composer.BraxEnv(environment), episode_length=1000, action_repeat=1)
-
-    def run(key):
-        play = lambda state, _: (new := wrapped.step(state, jnp.ones(1)), (new.done, new.reward))  # noqa: E731
-        return jax.lax.scan(play, wrapped.reset(key), length=11)[1]
-
-    done, reward = jax.jit(run)(jax.random.key(0))
-    assert not done.any(), "brax takes an environment's own `done` for a failure"
-    assert np.isnan(reward).tolist() == [False] * 10 + [True]
-
-
 @pytest.fixture(scope="module")
 def vector(environment):
     pytest.importorskip("gymnasium", reason="the vector environment: the extra interop")
@@ -222,30 +185,11 @@ def vector(environment):
 
 
 @pytest.mark.night
-def test_gymnasium_starts_copies_anew_when_they_are_done(vector):
-    env = vector
-    observation, _ = env.reset(seed=3)
-    assert env.observation_space.contains(observation)
-    assert env.action_space.low.tolist() == [[-1]] * 4
-    starts = observation["x"].copy()
-    for i in range(1, 12):
-        observation, reward, terminated, truncated, infos = env.step(np.ones((4, 1), np.float32))
-        assert truncated.tolist() == [i == 10] * 4
-        assert not terminated.any()
-        assert (infos["discount"] == 1).all()
-    assert observation["v"].tolist() == [[[0.0]]] * 4  # a new episode
-    assert (observation["x"] != starts).all()
-    assert reward.tolist() == [0.0] * 4
-    again, _ = env.reset(seed=3)
-    np.testing.assert_array_equal(again["x"], starts)
-
-
-@pytest.mark.night
 def test_the_end_of_a_task_is_no_truncation_and_divergence_is_the_end(vector):
     vector.reset(seed=0)
     places = jnp.array([[1.0], [jnp.nan], [0.0], [0.0]])
-    state = vector._last.state
-    vector._last = vector._last._replace(state=state.replace(data=state.data.replace(qpos=places)))
+    state = vector._last
+    vector._last = state.replace(data=state.data.replace(qpos=places))
     _, reward, terminated, truncated, infos = vector.step(np.zeros((4, 1)))
     assert terminated.tolist() == [True, True, False, False]
     assert not truncated.any()

@@ -29,24 +29,11 @@ ROBOT = """
     <body name="c" pos="0 0 1"><joint name="k"/><geom name="h" size=".1"/><site name="z"/></body>{inside}</worldbody>
   {beside}</mujoco>"""
 NAMING = {
-    "second joint": ("joint k", '<equality><joint joint1="j" joint2="k"/></equality>'),
-    "second body": ("body c", '<equality><weld body1="b" body2="c"/></equality>'),
-    "second site": ("site z", '<equality><connect site1="s" site2="z"/></equality>'),
-    "reference site": ("site z", '<actuator><general site="s" refsite="z" gear="1 0 0 0 0 0"/></actuator>'),
+    "joint": ("joint k", '<equality><joint joint1="j" joint2="k"/></equality>'),
     "side site": (
         "site z",
         '<tendon><spatial><site site="s"/><geom geom="g" sidesite="z"/><site site="s"/></spatial></tendon>',
     ),
-    "joint of a tendon": (
-        "joint k",
-        '<tendon><fixed><joint joint="j" coef="1"/><joint joint="k" coef="1"/></fixed></tendon>',
-    ),
-    "frame of a sensor": (
-        "site z",
-        '<sensor><framepos objtype="site" objname="s" reftype="site" refname="z"/></sensor>',
-    ),
-    "transmission": ("joint k", '<actuator><motor joint="k"/></actuator>'),
-    "pair": ("geom h", '<contact><pair geom1="g" geom2="h"/></contact>'),
     "tuple": ("body c", '<custom><tuple name="t"><element objtype="body" objname="c"/></tuple></custom>'),
     "target": ("body c", '<camera mode="targetbody" target="c"/>'),
 }

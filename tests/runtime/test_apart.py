@@ -112,9 +112,3 @@ def test_a_sender_that_runs_in_the_graph_is_refused():
     gs, tables, given = begun(graph, 0)
     with pytest.raises(UsageError, match="'sender' is not given"):
         graph.apart.drive(gs, tables, given, graph.apart.nodes["world"].step)
-
-
-def test_a_node_that_does_not_run_cannot_be_recorded(graph):
-    gs, tables, given = begun(graph, 0)
-    with pytest.raises(UsageError, match="no node 'sender' runs"):
-        graph.apart.run(gs, tables, given, "sender")

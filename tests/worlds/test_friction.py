@@ -50,26 +50,6 @@ def slide(params, slope, steps, start=(0.25, 0.0), world=None):
     return np.asarray(states.position), np.asarray(states.velocity)
 
 
-@given(speed=speeds, viscous=coefficients, drag=coefficients)
-def test_damping_is_viscous_and_drag(speed, viscous, drag):
-    found = friction.damping(FrictionParams(viscous=viscous, drag=drag), jnp.float32(speed))
-    assert float(found) == pytest.approx(viscous + drag * abs(speed), rel=1e-5, abs=1e-6)
-
-
-@given(
-    speed=speeds,
-    load=st.floats(-200.0, 200.0, width=32),
-    coulomb=coefficients,
-    static=coefficients,
-    stribeck=st.floats(0.0625, 10.0, width=32),
-    share=st.floats(0.0, 1.0, width=32),
-)
-def test_dry_friction_is_coulomb_stribeck_and_a_share_of_the_load(speed, load, coulomb, static, stribeck, share):
-    p = FrictionParams(coulomb=coulomb, static=static, stribeck_rad_s=stribeck, load=share)
-    expected = coulomb + static * math.exp(-abs(speed) / stribeck) + share * abs(load)
-    assert float(friction.dry(p, jnp.float32(speed), load)) == pytest.approx(expected, rel=1e-5, abs=1e-5)
-
-
 @given(speed=speeds, most=st.floats(0.0, 100.0, width=32))
 def test_stopped_takes_away_up_to_the_most_and_never_reverses(speed, most):
     after = float(friction.stopped(jnp.float32(speed), jnp.float32(most)))

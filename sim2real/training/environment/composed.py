@@ -11,7 +11,7 @@ import numpy as np
 from sim2real.composer.mjx_environment import MjxEnvironment
 from sim2real.composer.task import UNLIMITED
 from sim2real.errors import UsageError
-from sim2real.training.environment.protocol import Step, TrainingEnvironment
+from sim2real.training.environment.protocol import Step, TrainingEnvironment, to_vector
 from sim2real.training.environment.tasks import REWARD
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ class TaskEnvironment(TrainingEnvironment):
     def reset(self, key: jax.Array, width: jax.Array | None = None) -> tuple[TaskState, jax.Array]:
         """Return the state at the start of an episode and the first observation."""
         state = self.environment.reset(key)
-        return TaskState(state, state.terms), _vector(state)
+        return TaskState(state, state.terms), to_vector(state.observation)
 
     def step(self, state: TaskState, action: jax.Array, key: jax.Array) -> Step:
         """Make one control step; ``action (A,)`` [the actuators' units].
@@ -67,7 +67,13 @@ class TaskEnvironment(TrainingEnvironment):
         terms = {name: state.terms[name] + term for name, term in new.terms.items()}
         metrics = {f"{REWARD}{name}": term for name, term in terms.items()}
         return Step(
-            TaskState(new, terms), _vector(new), new.reward, terminated, new.truncated, jnp.bool_(True), metrics
+            TaskState(new, terms),
+            to_vector(new.observation),
+            new.reward,
+            terminated,
+            new.truncated,
+            jnp.bool_(True),
+            metrics,
         )
 
     def privileged(self, state: TaskState) -> jax.Array:
@@ -79,9 +85,3 @@ class TaskEnvironment(TrainingEnvironment):
         inner = state.inner
         leaves = jax.tree.leaves((inner.data.qpos, inner.data.qvel, inner.leaves, inner.variables))
         return jnp.concatenate([jnp.ravel(leaf).astype(jnp.float32) for leaf in leaves])
-
-
-def _vector(state: State) -> jax.Array:
-    """Return all observables as one vector, shape ``(O,)``."""
-    values = [jnp.ravel(value) for value in state.observation.values()]
-    return jnp.concatenate(values) if values else jnp.zeros(0)

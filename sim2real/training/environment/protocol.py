@@ -177,6 +177,12 @@ def choose(condition: jax.Array, new: T, old: T) -> T:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
 
 
+def to_vector(observation: PyTree) -> jax.Array:
+    """Return an observation as one vector ``(O,)``: a dictionary's observables one after the other, in their order."""
+    parts = [jnp.ravel(value) for value in (observation.values() if isinstance(observation, dict) else [observation])]
+    return jnp.concatenate(parts) if parts else jnp.zeros(0)
+
+
 def select(mask: jax.Array, new: T, old: T) -> T:
     """Return ``new`` where ``mask (N,)`` is true, else ``old``, for each of N copies; leaves ``(N, ...)``."""
 

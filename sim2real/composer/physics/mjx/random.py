@@ -44,7 +44,7 @@ class Registry:
 
 
 class JaxRandomState:
-    """Draws like a ``RandomState``, from a JAX key that it splits at every draw.
+    """Draws like a ``RandomState``, by methods with the same arguments, from a JAX key that it splits at every draw.
 
     Args:
         memory: What variations keep from draw to draw: name -> array.
@@ -76,69 +76,48 @@ class JaxRandomState:
         return key
 
     def uniform(self, low: ArrayLike = 0.0, high: ArrayLike = 1.0, size: Size = None) -> jax.Array:
-        """Return floats in ``[low, high)``."""
         low, high = jnp.asarray(low, float), jnp.asarray(high, float)
         return low + (high - low) * jax.random.uniform(self.next_key(), _shape(size, low, high))
 
     def normal(self, loc: ArrayLike = 0.0, scale: ArrayLike = 1.0, size: Size = None) -> jax.Array:
-        """Return normally distributed floats."""
         loc, scale = jnp.asarray(loc, float), jnp.asarray(scale, float)
         return loc + scale * jax.random.normal(self.next_key(), _shape(size, loc, scale))
 
     def lognormal(self, mean: ArrayLike = 0.0, sigma: ArrayLike = 1.0, size: Size = None) -> jax.Array:
-        """Return exponentials of normally distributed floats."""
         return jnp.exp(self.normal(mean, sigma, size))
 
     def exponential(self, scale: ArrayLike = 1.0, size: Size = None) -> jax.Array:
-        """Return exponentially distributed floats."""
         return jnp.asarray(scale, float) * jax.random.exponential(self.next_key(), _shape(size, scale))
 
     def poisson(self, lam: ArrayLike = 1.0, size: Size = None) -> jax.Array:
-        """Return Poisson distributed integers."""
         # JAX draws Poisson numbers with threefry keys only.
         key = jax.random.wrap_key_data(jax.random.key_data(self.next_key()), impl="threefry2x32")
         return jax.random.poisson(key, lam, _shape(size, lam))
 
     def binomial(self, n: ArrayLike, p: ArrayLike, size: Size = None) -> jax.Array:
-        """Return binomially distributed integers."""
         return jax.random.binomial(self.next_key(), n, p, _shape(size, n, p)).astype(int)
 
     def randint(self, low: ArrayLike, high: ArrayLike | None = None, size: Size = None) -> jax.Array:
-        """Return integers in ``[low, high)``, or in ``[0, low)``.
-
-        Args:
-            low: The lower bound; without ``high``, the upper one.
-        """
         low, high = (0, low) if high is None else (low, high)
         return jax.random.randint(self.next_key(), _shape(size, low, high), low, high)
 
     def choice(self, a: ArrayLike, size: Size = None, replace: bool = True, p: ArrayLike | None = None) -> jax.Array:
-        """Return items of ``a``, or integers below it, with probabilities ``p``.
-
-        Args:
-            p: Probability of each item; default: all the same.
-        """
         values = jnp.arange(a) if np.ndim(a) == 0 else jnp.asarray(a)
         return jax.random.choice(self.next_key(), values, _shape(size), replace, None if p is None else jnp.asarray(p))
 
     def permutation(self, x: ArrayLike) -> jax.Array:
-        """Return ``x``, or the integers below it, in random order."""
         return jax.random.permutation(self.next_key(), x)
 
     def random_sample(self, size: Size = None) -> jax.Array:
-        """Return floats in [0, 1)."""
         return self.uniform(size=size)
 
     def standard_normal(self, size: Size = None) -> jax.Array:
-        """Return floats of mean 0 and standard deviation 1."""
         return self.normal(size=size)
 
     def beta(self, a: ArrayLike, b: ArrayLike, size: Size = None) -> jax.Array:
-        """Return Beta distributed floats."""
         return jax.random.beta(self.next_key(), a, b, _shape(size, a, b))
 
     def gamma(self, shape: ArrayLike, scale: ArrayLike = 1.0, size: Size = None) -> Any:
-        """Return Gamma distributed floats."""
         return scale * jax.random.gamma(self.next_key(), shape, _shape(size, shape, scale))
 
     def shuffle(self, x: ArrayLike) -> None:
@@ -152,11 +131,9 @@ class JaxRandomState:
         raise AttributeError(f"on MJX random_state has no {name!r}. Available: {available}")
 
     def rand(self, *shape: int) -> jax.Array:
-        """Return floats in [0, 1)."""
         return self.uniform(size=shape)
 
     def randn(self, *shape: int) -> jax.Array:
-        """Return normally distributed floats."""
         return self.normal(size=shape)
 
 
