@@ -82,8 +82,6 @@ QUANTITIES: Mapping[str, Quantity] = {
                      20, 20, nominal=1.0, scale="factor"),
     "released": Quantity("1", "share of the drive's damping with torque off", _RELEASED, 0.0, 1.0, nominal=0.5),
     "zero": Quantity("rad", "encoder at the model's zero", _WEIGHT, -0.15, 0.15),
-    "speed": Quantity("rad/s", "speed without load under the largest torque: the damping is that torque over it",
-                      _LIMIT, 5, 5, "speed", "", 20.0, "factor"),
     "damping": Quantity("N m s/rad", "viscous friction", _FAST, 30, 30, "dof_damping", "", 0.1, "factor", True),
     "armature": Quantity("kg m^2", "rotor behind the gears", "fast changes of the command, up to a few hertz",
                          30, 30, "dof_armature", "", 0.01, "factor", True),
@@ -518,8 +516,7 @@ def place(
     def field(name: str) -> PyTree:
         return model.get(name, jnp.asarray(getattr(base.model, name)))
 
-    # A speed without load is the torque limit divided by the damping, so set the limit first.
-    for p in sorted(placed, key=lambda p: p.what == "speed"):
+    for p in placed:
         where = QUANTITIES[p.what].place
         if where == "factor" or p.what.startswith("tilt"):
             continue
@@ -535,9 +532,6 @@ def place(
             limits = field("jnt_actfrcrange")
             most = jnp.minimum(limits[joints[at], 1], value) if p.among_limits else value
             model["jnt_actfrcrange"] = limits.at[joints[at]].set(most[:, None] * jnp.array([-1.0, 1.0]))
-        elif where == "speed":
-            limits = field("jnt_actfrcrange")
-            model["dof_damping"] = field("dof_damping").at[dofs[at]].set(limits[joints[at], 1] / value)
         elif where == "payload":
             model["body_mass"] = field("body_mass").at[at].add(value)
         else:

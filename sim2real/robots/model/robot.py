@@ -275,7 +275,7 @@ class MjcfRobot(LoggedRobot):
         model = spec.compile()
         dofs = np.array([model.joint(name).dofadr[0] for name in config.joints])
         for p in self.placed:
-            field, at = "dof_damping" if p.what == "speed" else QUANTITIES[p.what].place, list(p.at)
+            field, at = QUANTITIES[p.what].place, list(p.at)
             if field.startswith("dof_"):
                 getattr(model, field)[dofs[at]] = np.asarray(getattr(world.model, field))[loop.dofs[at]]
             elif p.what == "gravcomp":
@@ -287,7 +287,7 @@ class MjcfRobot(LoggedRobot):
                 for i in p.at:
                     name = self.model.body(i).name
                     model.body_mass[model.body(name).id if name else i] += float(values[p.parameter.name])
-        if named & {"armature", "damping", "speed"}:
+        if named & {"armature", "damping"}:
             model.dof_armature[dofs] = np.asarray(world.model.dof_armature)[loop.dofs]
         copy_back(spec, model)
         return spec.to_xml()
