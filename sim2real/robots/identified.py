@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import copy
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Self
 
 from sim2real import pytree
-from sim2real.errors import UsageError
 from sim2real.graph.delays import TrainableDist
 from sim2real.graph.episode import Episode, named_leaves
 from sim2real.graph.node import BaseNode
 from sim2real.identification.model import Channel
 from sim2real.identification.parameters import Parameter, ParameterTable
-from sim2real.later import jnp
 from sim2real.robots.loop import ACTUATOR, SENSOR, WORLD
-from sim2real.robots.messages import EpisodeStart
-from sim2real.robots.robot import RecordedRobot, RobotModel
+from sim2real.robots.robot import RecordedRobot
 from sim2real.types import PyTree, Scalar
 from sim2real.worlds.recorded import RecordedActuator
 
@@ -32,14 +27,12 @@ class LoggedRobot(RecordedRobot):
         tick_s: The world's period, where samples fall between its ticks: the sensor then needs a tick of delay to
             interpolate. 0 where samples fall on ticks.
         burst: Extra commands in a delay's window, for commands that came faster than their rate.
-        other: The model of another world, in place of its own; None: its own.
     """
 
     channels: tuple[Channel, ...]
     delayed: str = "command to measurement"
     tick_s: float = 0.0
     burst: int = 0
-    other: RobotModel | None = None
 
     @abstractmethod
     def dynamics(self) -> list[Parameter]:
@@ -60,11 +53,6 @@ class LoggedRobot(RecordedRobot):
     def identifiable(self, max_delay_s: float) -> IdentifiableRecording:
         return IdentifiableRecording(self, max_delay_s)
 
-    def in_model(self, model: RobotModel) -> Self:
-        robot = copy.copy(self)
-        robot.other = model
-        return robot
-
 
 class IdentifiableRecording:
     """Simulates what the sensor measured from recorded commands; an ``identification.model.IdentifiableModel``.
@@ -79,9 +67,6 @@ class IdentifiableRecording:
     def __init__(self, robot: LoggedRobot, max_delay_s: float) -> None:
         self._robot, self.channels = robot, robot.channels
         rows, tick_s = robot.dynamics(), robot.tick_s
-        if robot.other is not None:
-            beside = [p for p in rows if not (p.leaf or "").startswith(f"{WORLD}.")]
-            rows = [*(replace(p, leaf=None) for p in robot.other.dynamics()), *beside]
         if tick_s:
             tick = Parameter("sensor_delay", "s", tick_s, 0.0, 2 * tick_s, "linear", "delay")
             rows.append(replace(tick, about="the sensor's interpolation", free=False, side="measurement"))
@@ -97,13 +82,6 @@ class IdentifiableRecording:
         """Return sensor, actuator and world; the world receives commands up to ``max_delay_s`` [s] late."""
         robot = self._robot
         sensor, actuator, world = robot.make_nodes()
-        if robot.other is not None:
-            own, world = world, robot.other.make_world(resumed=True)
-            if world.rate != own.rate:
-                raise UsageError(
-                    f"this world has {world.rate:g} ticks a second, that of these recordings {own.rate:g}",
-                    hint="samples of the recordings must fall on ticks of the world",
-                )
         to_world = TrainableDist.create(max_delay_s / 4, 0.0, max_delay_s, "zoh_mean", burst=robot.burst)
         world.connect(actuator, skip=True, delay_dist=to_world)
         tick_s = robot.tick_s
@@ -120,9 +98,4 @@ class IdentifiableRecording:
         Args:
             start: Shape ``(2 * channels,)``: initial positions, then velocities.
         """
-        other = self._robot.other
-        params = self._robot.started(self.parameters.placed(self._params, values), start)
-        if other is None:
-            return params
-        position, velocity = jnp.split(jnp.asarray(params[WORLD].start), 2)
-        return {**params, WORLD: other.params(values, EpisodeStart(position, velocity, jnp.zeros(0)))}
+        return self._robot.started(self.parameters.placed(self._params, values), start)

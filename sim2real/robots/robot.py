@@ -357,13 +357,6 @@ class RecordedRobot(Simulated, ABC):
         """
         return self
 
-    def in_model(self, model: RobotModel) -> Self:
-        """Return the robot in another simulation."""
-        raise UsageError(
-            f"{type(self).__name__} makes its nodes itself: it cannot use another world",
-            hint="only robots that inherit from Robot or LoggedRobot can",
-        )
-
     def doubts(self, outputs: Mapping[str, PyTree]) -> list[str]:
         """Return sentences on positions of a log that the model cannot have; default: none."""
         return []
@@ -421,6 +414,7 @@ class Robot(RecordedRobot):
         return loop
 
     def in_model(self, model: RobotModel) -> Self:
+        """Return the robot in another simulation."""
         moved = copy.copy(self)
         moved.model = model
         return moved
@@ -618,6 +612,11 @@ def in_world(robot: AnyRobot, name: str | None) -> AnyRobot:
     """
     if name is None:
         return robot
+    if not isinstance(robot, Robot):
+        raise UsageError(
+            f"{type(robot).__name__} was recorded: it stays in the world of its recordings",
+            hint="only robots that inherit from sim2real.robots.robot.Robot can use another world",
+        )
     from sim2real.hardware.registry import WORLDS, load_entry
 
     model = load_entry("world", name, WORLDS, "robots.robot.RobotModel")(robot)
