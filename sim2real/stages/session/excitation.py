@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +21,8 @@ from sim2real.stages.terminal.console import note
 
 _ROUNDED = 1e-6
 """Excess over a limit that is a rounding error [the command's unit]."""
+_LEAST_S = 1.0
+"""Shortest motion [s]."""
 
 
 def played(config: RecordConfig, robot: Robot, announce: bool = False) -> np.ndarray:
@@ -40,98 +41,26 @@ def played(config: RecordConfig, robot: Robot, announce: bool = False) -> np.nda
         return bent
     if config.motion is None:
         return excitation(config, robot.rate_hz, commands).reshape(-1, commands)
-    motion = read_motion(config.motion, robot, names_of(config, robot))
-    rows = _within(_sampled(motion, robot.rate_hz, config.duration_s), config, robot)
+    # The names of the robot's commands: its joints, otherwise their numbers.
+    names = robot.drive.gate(config.gate).joints
+    if len(names) != commands:
+        names = tuple(f"{robot.drive.command}[{i}]" for i in range(commands))
+    t_s, motion, source = _read_motion(config.motion, robot, names)
+    steps_s = np.arange(0.0, min(t_s[-1], config.duration_s), 1.0 / robot.rate_hz)
+    sampled = np.stack([np.interp(steps_s, t_s, column) for column in motion.T], axis=1)
+    rows = _within(sampled, config, robot, names)
     if announce:
-        skipped_s = min(motion.t_s[-1], config.duration_s) - len(rows) / robot.rate_hz
-        note(f"motion: {motion.source}, {len(rows) / robot.rate_hz:.1f} s")
+        skipped_s = min(t_s[-1], config.duration_s) - len(rows) / robot.rate_hz
+        note(f"motion: {source}, {len(rows) / robot.rate_hz:.1f} s")
         if skipped_s > 2.0 / robot.rate_hz:
             note(f"motion: {skipped_s:.1f} s at its ends are outside of the limits, and are not played")
     return rows - robot.drive.around(np.zeros((1, commands)))
 
 
-def names_of(config: RecordConfig, robot: Robot) -> tuple[str, ...]:
-    """Return the names of the robot's commands: its joints, otherwise their numbers."""
-    count = len(robot.agent.action)
-    names = robot.drive.gate(config.gate).joints
-    return names if len(names) == count else tuple(f"{robot.drive.command}[{i}]" for i in range(count))
-
-
-def _sampled(motion: FileMotion, rate_hz: float, duration_s: float) -> np.ndarray:
-    """Return a motion at the robot's rate, ``(N, commands)``."""
-    t_s = np.arange(0.0, min(motion.t_s[-1], duration_s), 1.0 / rate_hz)
-    return np.stack([np.interp(t_s, motion.t_s, column) for column in motion.commands.T], axis=1)
-
-
-def _within(rows: np.ndarray, config: RecordConfig, robot: Robot) -> np.ndarray:
-    """Return the motion without its beginning and its end outside the limits, where an arm lies without torque.
-
-    Raises:
-        UsageError: It leaves the limits in between, or is too fast; the robot has not moved.
-    """
-    gate = robot.drive.gate(config.gate)
-    low, high = (np.broadcast_to(np.asarray(end, np.float64), rows.shape[1]) for end in gate.range)
-    low, high = low - _ROUNDED, high + _ROUNDED
-    inside = np.flatnonzero(((rows >= low) & (rows <= high)).all(axis=1))
-    if not inside.size:
-        raise UsageError(
-            f"{config.motion} is outside of the limits everywhere: {_worst(rows, low, high, config, robot)}"
-        )
-    rows = rows[inside[0] : inside[-1] + 1]
-    if ((rows < low) | (rows > high)).any():
-        raise UsageError(
-            f"{config.motion} leaves the robot's limits: {_worst(rows, low, high, config, robot)}",
-            hint="record it again within them; a limit is the smaller one of the robot's and --gate.limit",
-        )
-    speed, unit = np.abs(np.diff(rows, axis=0)) * robot.rate_hz, robot.units[robot.drive.command]
-    most = np.inf if gate.slew_per_s is None else gate.slew_per_s
-    if unit == "rad" and gate.max_speed_rad_s is not None:
-        most = np.minimum(most, gate.max_speed_rad_s)
-    most = np.broadcast_to(most, rows.shape[1])
-    if (speed > most).any():
-        row, column = np.unravel_index((speed - most).argmax(), speed.shape)
-        name = names_of(config, robot)[column]
-        raise UsageError(
-            f"{config.motion} is too fast: {name} moves at {speed[row, column]:.3g} {unit}/s "
-            f"at {row / robot.rate_hz:.2f} s, {most[column]:g} are allowed",
-            hint="move slower; --gate.slew-per-s and --gate.max-speed-rad-s are the limits",
-        )
-    return rows
-
-
-def _worst(rows: np.ndarray, low: np.ndarray, high: np.ndarray, config: RecordConfig, robot: Robot) -> str:
-    """Return the command that is farthest beyond its limits."""
-    beyond = np.maximum(low - rows, rows - high)
-    row, column = np.unravel_index(beyond.argmax(), beyond.shape)
-    name, value, unit = names_of(config, robot)[column], rows[row, column], robot.units[robot.drive.command]
-    return (
-        f"{name} is {value:.3g} {unit} at {row / robot.rate_hz:.2f} s, and must lie in "
-        f"[{low[column]:.3g}, {high[column]:.3g}]"
-    )
-
-
 # -- a motion from a file
 
-_LEAST_S = 1.0
-"""Shortest motion [s]."""
 
-
-@dataclass(frozen=True)
-class FileMotion:
-    """Commands over time.
-
-    Attributes:
-        t_s: Times ``(N,)``, increasing [s].
-        commands: Shape ``(N, commands)`` [the command's unit].
-        source: What of the file it is, for the user.
-    """
-
-    t_s: np.ndarray
-    commands: np.ndarray
-    source: str
-
-
-def read_motion(path: Path, robot: Robot, names: Sequence[str]) -> FileMotion:
+def _read_motion(path: Path, robot: Robot, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray, str]:
     """Return the motion in a file: goals if it has them, otherwise measured positions.
 
     A log of this robot, a file that the pipeline's ``import.toml`` maps, or any file that ``sim2real import`` reads
@@ -140,54 +69,89 @@ def read_motion(path: Path, robot: Robot, names: Sequence[str]) -> FileMotion:
     Args:
         names: The robot's commands.
 
+    Returns:
+        Increasing times from 0 ``(N,)`` [s], commands ``(N, commands)`` [the command's unit], and what they are.
+
     Raises:
         UsageError: The file has no such motion.
     """
     if not path.exists():
         raise UsageError(f"there is no motion {path}", hint="--excitation FILE is a log, or a csv, npz or parquet file")
     if path.suffix == ".mcap":
-        motion = _of_log(path, robot)
+        t_s, rows, source = _of_log(path, robot)
     elif (mapping := mapping_of(robot, path)) is not None:
         episode = import_file(path, mapping)
         rows = episode.outputs[ACTUATOR][robot.drive.command]
-        motion = FileMotion(episode.steps[ACTUATOR].begun_s, rows, f"{robot.drive.command} of {path.name}")
+        t_s, source = episode.steps[ACTUATOR].begun_s, f"{robot.drive.command} of {path.name}"
     else:
-        motion = FileMotion(*joint_motion(open_tables(path)[0], names, robot.units[robot.drive.command]))
-    return _whole(motion, path, len(names))
-
-
-def _of_log(path: Path, robot: Robot) -> FileMotion:
-    """Return the commands of a log; of one that was guided by hand the measured positions."""
-    episode = read_log(path)
-    sent = episode.outputs.get(ACTUATOR, {}).get(robot.drive.command)
-    if sent is not None and len(sent):
-        return FileMotion(episode.steps[ACTUATOR].end / TICKS_PER_S, sent, f"{robot.drive.command} of {path.name}")
-    field = next((c.position for c in robot.sensor.channels if c.goal == robot.drive.command), None)
-    measured = episode.outputs.get(SENSOR, {}).get(field or "")
-    if measured is None:
-        raise UsageError(
-            f"{path} has no {robot.drive.command!r} of {ACTUATOR!r}",
-            hint="is it a log of this robot? Measured positions are a motion only for position-controlled joints",
-        )
-    return FileMotion(episode.steps[SENSOR].begun_s, measured, f"{field} of {path.name}")
-
-
-def _whole(motion: FileMotion, path: Path, commands: int) -> FileMotion:
-    """Return a motion in the order of time, from time 0.
-
-    Raises:
-        UsageError: It is too short, or has another number of commands.
-    """
-    rows = np.asarray(motion.commands, np.float64).reshape(len(motion.commands), -1)
-    if rows.shape[1] != commands:
-        raise UsageError(f"{path} has {rows.shape[1]} commands for a robot with {commands}")
-    later = np.flatnonzero(np.diff(motion.t_s, prepend=-np.inf) > 0)
-    t_s, rows = motion.t_s[later], rows[later]
+        t_s, rows, source = joint_motion(open_tables(path)[0], names, robot.units[robot.drive.command])
+    rows = np.asarray(rows, np.float64).reshape(len(rows), -1)
+    if rows.shape[1] != len(names):
+        raise UsageError(f"{path} has {rows.shape[1]} commands for a robot with {len(names)}")
+    later = np.flatnonzero(np.diff(t_s, prepend=-np.inf) > 0)
+    t_s, rows = t_s[later], rows[later]
     if len(later) < 2 or t_s[-1] - t_s[0] < _LEAST_S:
         raise UsageError(f"the motion of {path} is shorter than {_LEAST_S:g} s")
     if not np.isfinite(rows).all():
         raise UsageError(f"the motion of {path} holds values that are no numbers")
-    return FileMotion(t_s - t_s[0], rows, motion.source)
+    return t_s - t_s[0], rows, source
+
+
+def _of_log(path: Path, robot: Robot) -> tuple[np.ndarray, np.ndarray, str]:
+    """Return the commands of a log; of one that was guided by hand the measured positions."""
+    episode, field = read_log(path), robot.drive.command
+    sent = episode.outputs.get(ACTUATOR, {}).get(field)
+    if sent is not None and len(sent):
+        return episode.steps[ACTUATOR].end / TICKS_PER_S, sent, f"{field} of {path.name}"
+    position = next((c.position for c in robot.sensor.channels if c.goal == field), "")
+    measured = episode.outputs.get(SENSOR, {}).get(position)
+    if measured is None:
+        raise UsageError(
+            f"{path} has no {field!r} of {ACTUATOR!r}",
+            hint="is it a log of this robot? Measured positions are a motion only for position-controlled joints",
+        )
+    return episode.steps[SENSOR].begun_s, measured, f"{position} of {path.name}"
+
+
+def _within(rows: np.ndarray, config: RecordConfig, robot: Robot, names: Sequence[str]) -> np.ndarray:
+    """Return the motion without its beginning and its end outside the limits, where an arm lies without torque.
+
+    Raises:
+        UsageError: It leaves the limits in between, or is too fast; the robot has not moved.
+    """
+    gate, unit, rate_hz = robot.drive.gate(config.gate), robot.units[robot.drive.command], robot.rate_hz
+    low, high = (np.broadcast_to(np.asarray(end, np.float64), rows.shape[1]) for end in gate.range)
+    beyond = np.maximum(low - rows, rows - high) - _ROUNDED
+
+    def farthest(begin: int, end: int) -> str:
+        row, i = np.unravel_index(beyond[begin:end].argmax(), beyond[begin:end].shape)
+        return (
+            f"{names[i]} is {rows[begin + row, i]:.3g} {unit} at {row / rate_hz:.2f} s, and must lie in "
+            f"[{low[i]:.3g}, {high[i]:.3g}]"
+        )
+
+    inside = np.flatnonzero((beyond <= 0.0).all(axis=1))
+    if not inside.size:
+        raise UsageError(f"{config.motion} is outside of the limits everywhere: {farthest(0, len(rows))}")
+    begin, end = int(inside[0]), int(inside[-1]) + 1
+    if (beyond[begin:end] > 0.0).any():
+        raise UsageError(
+            f"{config.motion} leaves the robot's limits: {farthest(begin, end)}",
+            hint="record it again within them; a limit is the smaller one of the robot's and --gate.limit",
+        )
+    speed = np.abs(np.diff(rows[begin:end], axis=0)) * rate_hz
+    most = np.inf if gate.slew_per_s is None else gate.slew_per_s
+    if unit == "rad" and gate.max_speed_rad_s is not None:
+        most = np.minimum(most, gate.max_speed_rad_s)
+    most = np.broadcast_to(most, rows.shape[1])
+    if (speed > most).any():
+        row, i = np.unravel_index((speed - most).argmax(), speed.shape)
+        raise UsageError(
+            f"{config.motion} is too fast: {names[i]} moves at {speed[row, i]:.3g} {unit}/s "
+            f"at {row / rate_hz:.2f} s, {most[i]:g} are allowed",
+            hint="move slower; --gate.slew-per-s and --gate.max-speed-rad-s are the limits",
+        )
+    return rows[begin:end]
 
 
 # -- generated signals
