@@ -54,11 +54,6 @@ class DataSheet:
     stribeck_rad_s: float | None = None
 
     @property
-    def worn(self) -> bool:
-        """Whether dry friction wears off with speed."""
-        return self.stribeck_rad_s is not None
-
-    @property
     def full_rad(self) -> float:
         """Position error at which the duty is full [rad]."""
         return dynamixel.FAMILY.full_rad / self.p_gain

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from sim2real.robots.loop import DELAYS
-from sim2real.robots.robot import Robot, RobotDrive
+from sim2real.robots.robot import Robot
 from sim2real.robots.walking.body import Terrain
 from sim2real.robots.walking.drive import BodySensor, LegMotors, WalkingDrive
 from sim2real.robots.walking.stand import LegsInAStand
@@ -63,7 +63,7 @@ class ComposedRobot(Robot):
     def __init__(self) -> None:
         stance = np.asarray(self.stance, np.float32)
         self.sensor = BodySensor(self.joints, stance, self.noise)
-        self.drive: RobotDrive = self.make_drive()
+        self.drive = WalkingDrive(self.mjcf, self.joints, self.stance, self.policy_hz, self.gains, self.motors)
         self.agent = WalkingAgent(self.joints, stance, self.scale, self.history, self.commands)
         joints = JointParameters(self.joints, self.groups or {"joint": range(len(self.joints))})
         self.model: WalkingModel = WalkingModel(self.make_task, joints, self.height_m, self.terrain)
@@ -81,10 +81,6 @@ class ComposedRobot(Robot):
         """Return the composed task; in training the floor sees the feet alone."""
         ground = self.terrain.growing() if rough else None
         return Ground(self.mjcf, self.feet, self.touching_m, self.feet, ground)
-
-    def make_drive(self) -> RobotDrive:
-        """Return the motors; default: targets of all joints, for the device of ``motors``."""
-        return WalkingDrive(self.mjcf, self.joints, self.stance, self.policy_hz, self.gains, self.motors)
 
     def commanded(self, command: tuple[float, float, float]) -> ComposedRobot:
         """Return the robot with this command in all trials."""
