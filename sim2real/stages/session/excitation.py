@@ -124,7 +124,7 @@ def _within(rows: np.ndarray, config: RecordConfig, robot: Robot, names: Sequenc
     beyond = np.maximum(low - rows, rows - high) - _ROUNDED
 
     def farthest(begin: int, end: int) -> str:
-        row, i = np.unravel_index(beyond[begin:end].argmax(), beyond[begin:end].shape)
+        row, i = map(int, np.unravel_index(beyond[begin:end].argmax(), beyond[begin:end].shape))
         return (
             f"{names[i]} is {rows[begin + row, i]:.3g} {unit} at {row / rate_hz:.2f} s, and must lie in "
             f"[{low[i]:.3g}, {high[i]:.3g}]"
@@ -145,7 +145,7 @@ def _within(rows: np.ndarray, config: RecordConfig, robot: Robot, names: Sequenc
         most = np.minimum(most, gate.max_speed_rad_s)
     most = np.broadcast_to(most, rows.shape[1])
     if (speed > most).any():
-        row, i = np.unravel_index((speed - most).argmax(), speed.shape)
+        row, i = map(int, np.unravel_index((speed - most).argmax(), speed.shape))
         raise UsageError(
             f"{config.motion} is too fast: {names[i]} moves at {speed[row, i]:.3g} {unit}/s "
             f"at {row / rate_hz:.2f} s, {most[i]:g} are allowed",
