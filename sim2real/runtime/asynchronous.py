@@ -48,7 +48,6 @@ class AsyncGraph:
         duration_s: Length of drawn timelines [s]; the simulated clock needs this or ``timeline``.
         timeline: Timelines to play; the graph state's ``eps`` selects the episode. Simulated clock only.
         timeout_s: Longest wait of a call for the next step, and of the supervisor for its caller [s].
-        spin_s: Time before each step in which a thread polls the clock instead of sleeping [s]. Wall clock only.
         step_timeout_s: Time after which a step of any node counts as hanging, which stops the graph [s]; 0: never;
             default: ten periods of its node, at least 1 s. The caller's time does not count. Wall clock only.
 
@@ -65,7 +64,6 @@ class AsyncGraph:
         duration_s: float | None = None,
         timeline: Timeline | None = None,
         timeout_s: float = 30.0,
-        spin_s: float = 0.0,
         step_timeout_s: float | None = None,
     ) -> None:
         self.nodes = collect(nodes, supervisor)
@@ -75,7 +73,7 @@ class AsyncGraph:
         self._monotonic = clock if own_time else MonotonicClock()
         self.recorder = recorder
         self._duration_s, self._timeline = duration_s, timeline
-        self._timeout_s, self._spin_s, self._step_timeout_s = timeout_s, spin_s, step_timeout_s
+        self._timeout_s, self._step_timeout_s = timeout_s, step_timeout_s
         self._steppers = {name: Stepper(node) for name, node in self.nodes.items()}
         self._jit = True
         self._run: WallClockRun | SimulatedRun | None = None
@@ -221,12 +219,12 @@ class AsyncGraph:
         if simulated:
             if (self._duration_s is None) == (self._timeline is None):
                 raise UsageError("the simulated clock takes a duration_s or a timeline, one of them")
-            if self._spin_s or self._step_timeout_s is not None:
-                raise UsageError("spin_s and step_timeout_s are for the wall clock")
+            if self._step_timeout_s is not None:
+                raise UsageError("step_timeout_s is for the wall clock")
         elif self._duration_s is not None or self._timeline is not None:
             raise UsageError("duration_s and timeline are for the simulated clock")
-        if not (self._spin_s >= 0 and (self._step_timeout_s or 0.0) >= 0 and self._timeout_s > 0):
-            raise UsageError("spin_s and step_timeout_s must be at least 0, timeout_s must be positive")
+        if not ((self._step_timeout_s or 0.0) >= 0 and self._timeout_s > 0):
+            raise UsageError("step_timeout_s must be at least 0, timeout_s must be positive")
 
         # Averaged inputs.
         for node in self.nodes.values():
@@ -272,7 +270,7 @@ class AsyncGraph:
         if self.clock is Clock.SIMULATED:
             run = SimulatedRun(*common, *self._timeline_of(graph_state))
         else:
-            run = WallClockRun(*common, self._monotonic, self._spin_s, self._timeout_s, self._step_timeout_s)
+            run = WallClockRun(*common, self._monotonic, self._timeout_s, self._step_timeout_s)
 
         # Publish it, so that stop() in another thread finds it, and begin.
         with self._lock:

@@ -65,19 +65,14 @@ class MonotonicClock:
         """Give the calling thread a real-time priority; see the function."""
         keep_time()
 
-    def sleep_past(self, tick: int, stopping: threading.Event, spin: int = 0) -> bool:
+    def sleep_past(self, tick: int, stopping: threading.Event) -> bool:
         """Sleep until the clock shows more than ``tick``; return False if ``stopping`` was set meanwhile.
 
         "More", because a message that arrives while the clock shows ``tick`` belongs to a step that starts at ``tick``.
-
-        Args:
-            spin: Time to poll instead of sleeping at the end [ticks].
         """
-        while (rest := tick + 1 - spin - self.now()) > 0:
+        while (rest := tick + 1 - self.now()) > 0:
             if stopping.wait(rest / TICKS_PER_S):
                 return False
-        while self.now() <= tick:
-            pass
         return not stopping.is_set()
 
 

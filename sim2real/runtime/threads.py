@@ -217,7 +217,6 @@ class Shared:
     Args:
         recorder: Receives all steps and messages, or None.
         wake: Called when the graph stops: wakes threads that wait for messages or for the caller.
-        spin: Time before each step in which a thread polls the clock instead of sleeping [ticks].
         answer_timeout_s: Longest wait of the supervisor for its caller [s].
     """
 
@@ -227,10 +226,9 @@ class Shared:
         recorder: Recorder | None,
         graph_state: GraphState,
         wake: Callable[[], None],
-        spin: int,
         answer_timeout_s: float,
     ) -> None:
-        self.clock, self.recorder, self.graph_state, self.spin = clock, recorder, graph_state, spin
+        self.clock, self.recorder, self.graph_state = clock, recorder, graph_state
         self.answer_timeout_s = answer_timeout_s
         self.timeout_s = answer_timeout_s
         self.go, self.stopping = clock.event(), clock.event()
@@ -369,7 +367,7 @@ class NodeThread(threading.Thread):
             begin = start(scheduled, drift, end, blocked, waits)
             later = next_drift(node.scheduling, scheduled, drift, end)
             overrun = end > max(scheduled + drift, blocked)
-            if not clock.sleep_past(begin, shared.stopping, shared.spin):
+            if not clock.sleep_past(begin, shared.stopping):
                 return
             woken = clock.now()
             # Consume messages and make the step.

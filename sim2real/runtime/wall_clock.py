@@ -9,7 +9,7 @@ from typing import NoReturn
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.episode import Recorder
-from sim2real.graph.node import TICKS_PER_S, BaseNode
+from sim2real.graph.node import BaseNode
 from sim2real.runtime.clock import MonotonicClock, realtime
 from sim2real.runtime.failure import GraphTimeout
 from sim2real.runtime.statistics import NodeStatistics
@@ -25,7 +25,6 @@ class WallClockRun:
 
     Args:
         recorder: Receives all steps and messages, or None.
-        spin_s: Time before each step in which a thread polls the clock instead of sleeping [s].
         timeout_s: Longest wait of the supervisor for its caller [s].
         step_timeout_s: Longest time of a step, see ``step_limits``.
     """
@@ -40,7 +39,6 @@ class WallClockRun:
         recorder: Recorder | None,
         autonomous: bool,
         clock: MonotonicClock,
-        spin_s: float,
         timeout_s: float,
         step_timeout_s: float | None,
     ) -> None:
@@ -48,7 +46,7 @@ class WallClockRun:
         self._graph_state, self._recorder, self._gym = graph_state, recorder, not autonomous
         self._clock = clock
         self._handover = Handover(autonomous, clock)
-        self._shared = Shared(self._clock, recorder, graph_state, self._wake, round(spin_s * TICKS_PER_S), timeout_s)
+        self._shared = Shared(self._clock, recorder, graph_state, self._wake, timeout_s)
         self._channels = {(n, c.name): MessageChannel(c, self._clock) for n in nodes for c in nodes[n].inputs.values()}
         self._threads: dict[str, NodeThread] = {}
         for name, node in nodes.items():

@@ -72,9 +72,9 @@ def test_a_blocking_step_waits_for_its_quota(clock):
 def test_a_late_awakening_is_logged_and_consumes_by_its_start(clock, monkeypatch):
     punctual = MonotonicClock.sleep_past
 
-    def late(self, tick, stopping, spin=0):
+    def late(self, tick, stopping):
         extra = 4_000 if threading.current_thread().name == "sim2real:agent" else 0
-        return punctual(self, tick + extra, stopping, spin)
+        return punctual(self, tick + extra, stopping)
 
     monkeypatch.setattr(VirtualClock, "sleep_past", late)
     sensor, agent = Plain("sensor", 500), Plain("agent", 50)
