@@ -18,6 +18,7 @@ from sim2real.artifacts import run as run_folder
 from sim2real.artifacts.identification import Identification, Judgement
 from sim2real.commands import flags, run, stages
 from sim2real.commands.stages import module_of
+from sim2real.runtime.failure import named
 from sim2real.stages.config import RecordConfig
 from sim2real.stages.load import defaults_of
 from sim2real.stages.validate.config import ValidateConfig
@@ -145,6 +146,31 @@ def test_errors_become_exit_codes(monkeypatch, capsys, kind, code):
     fail_with(monkeypatch, kind("it broke", hint="mend it"))
     assert cli.main(["record", "pendulum"]) == code
     assert capsys.readouterr() == ("", "error: it broke\n\nhint: mend it\n")
+
+
+def noted():
+    error = named(errors.HardwareLost("no answer", hint="check the cable"), "sensor", "step 12")
+    error.add_note("then: OSError:\n disk full")
+    return error
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (
+            noted(),
+            4,
+            "error: no answer\n  node 'sensor', step 12\n  then: OSError: disk full\n\nhint: check the cable\n",
+        ),
+        (named(KeyError("x"), "agent", "step 3"), 1, "error: node 'agent' failed in its step 3: KeyError: 'x'\n"),
+        (SystemExit(143), 143, "ended by SIGTERM\n"),
+    ],
+)
+def test_notes_stand_between_message_and_hint_and_signals_are_named(monkeypatch, capsys, tmp_path, error, code, said):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    fail_with(monkeypatch, error)
+    assert cli.main(["record", "pendulum"]) == code
+    assert capsys.readouterr() == ("", said)
 
 
 def test_debug_adds_the_traceback(monkeypatch, capsys):
