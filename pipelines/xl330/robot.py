@@ -44,7 +44,7 @@ class ServoOnArm(LoggedRobot):
             Parameter("gears", "1", 0.15, 0.02, 0.4, linear, about="share of the load that rubs", leaf="world.gears"),
             Parameter("static", "1", 0.05, 0.0, 0.3, linear, about="more of it at rest", leaf="world.static"),
             Parameter("stribeck", "rad/s", 0.1, 0.02, 1.0, about="speed that ends it", leaf="world.stribeck_rad_s"),
-            Parameter("released", "1", 0.5, 0.01, 1.0, linear, about="share, torque off", leaf="world.released"),
+            Parameter("released", "1", 0.5, 0.0, 1.0, linear, about="share, torque off", leaf="world.released"),
             Parameter("offset", "rad", 0.0, -0.06, 0.06, linear, "measurement", "encoder", leaf="world.offset"),
         ]
 
