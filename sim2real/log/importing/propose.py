@@ -479,6 +479,9 @@ class Proposal:
         try:
             episode = import_table(self.table, self.with_policies(drops))
         except UsageError as error:
+            # Samples that lack a number are known also where an answer is needed before the import.
+            self.mapping = self.with_policies({n: {"missing": "drop"} if n in lacking else {} for n in drops})
+            self.reasons |= {(n, "", "missing"): "samples lack a number" for n in drops if n in lacking}
             if inferred and goal is not None and not self.questions:
                 text = str(error).partition("\n")[0]
                 self.questions[(*inferred[0], "unit")] = f'"{goal.unit}" or another?  # {text}; --unit answers, too'
