@@ -83,7 +83,7 @@ def parse(arguments: Sequence[str]) -> tuple[Any, argparse.Namespace]:
     module.add_flags(parser)
     parser.add_argument("--quick", action="store_true", help="tiny sizes: shows that it runs, measures nothing")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write a report")
-    parser.add_argument("--commit", help="the commit of this copy of the code, where the copy has no git history")
+    parser.add_argument("--commit", help="the commit of the code that was measured, where git does not tell it")
     if "--quick" in chosen.flags:
         parser.set_defaults(**module.QUICK)
     return module, parser.parse_args(chosen.flags)
@@ -100,10 +100,11 @@ def origin(arguments: Sequence[str], options: argparse.Namespace) -> dict[str, A
     flags = {n: v.name if isinstance(v, Path) else v for n, v in vars(options).items() if n not in hidden}
     seeds = {n: v for n, v in flags.items() if n in ("seed", "seeds", "first", "first_seed")}
     changed = [line[3:] for line in git("status", "--porcelain").splitlines() if not line[3:].startswith("reports/")]
+    changed = [] if options.commit else changed
     return {
         "bench": options.bench,
         "command": shlex.join(["python", "scripts/bench.py", *map(short, arguments)]),
-        "commit": git("rev-parse", "HEAD").strip() or options.commit,
+        "commit": options.commit or git("rev-parse", "HEAD").strip(),
         "date": datetime.date.today().isoformat(),
         "machine": machine(),
         "versions": versions(),

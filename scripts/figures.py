@@ -29,6 +29,8 @@ TABLES = {
     "worst_joint": ("recorded.league.worst_joint", "league"),
     "latency": ("latency.table", "latency_league"),
     "randomise": ("hidden.randomise.table", "randomise", "randomise_worn"),
+    "pays": ("pays.table", "pays"),
+    "pays_units": ("pays.units", "pays"),
     "compiled": ("graph.table", "graph_h200"),
     "on_a_gpu": ("train.table", "train_h200"),
     "warp": ("compose.table", "compose_warp_h200"),
@@ -42,6 +44,7 @@ TABLES = {
 """Name between the markers -> function of a bench, and the reports that it gets."""
 IMAGES = {
     "docs/images/what_training_knows.svg": ("hidden.randomise.figure", "randomise", "randomise_worn"),
+    "docs/images/identification_pays.svg": ("pays.figure", "pays"),
     "docs/images/falls_over_delay.svg": ("walking.delays.figure", "walk_delays"),
 }
 

@@ -10,7 +10,12 @@ way is trained with that seed. All four are judged on the unit on several days, 
 the computer of its own, and with the same aims. Loads are drawn from the same range by all ways.
 
 The judge is C MuJoCo with the emulation's servos, on a clock of its own; no code of the training moves it. Every result
-is a file in the folder of --work, and what is there is not computed again: the same command continues.
+is a file in the folder of --work, and what is there is not computed again: the same command continues. Rows compare the
+seeds whose trainings of all ways are in the folder; a task without such a seed has no figures.
+
+    python scripts/bench.py pays --minutes 0 --work runs/pays --measured there.json --commit HASH --json pays.json
+
+computes a report from results of another machine, whose own report ``there.json`` names that machine.
 """
 
 from __future__ import annotations
@@ -22,7 +27,7 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -126,6 +131,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--work", type=Path, help="folder of the results; what is in it is used again")
     parser.add_argument("--minutes", type=float, default=1e6, help="time after which nothing new is begun")
     parser.add_argument("--jobs", type=int, default=1, help="trainings at once, one processor each")
+    parser.add_argument("--measured", type=Path, help="report of the machine on which the folder's results were made")
 
 
 def run(options: argparse.Namespace) -> Report:
@@ -158,7 +164,9 @@ def run(options: argparse.Namespace) -> Report:
         models = [json.loads(file.read_text()) for file in sorted(options.folder.glob("*/about.json"))]
     del options.folder, options.until
     ranges = {name: wide_ranges(name) for name in options.robots}
-    return {"rows": rows(results), "ranges": ranges, "models": models, "results": results}
+    there = json.loads(options.measured.read_text()) if options.measured else {}
+    about = {n: there[n] for n in ("date", "machine", "versions") if n in there}
+    return {**about, "rows": rows(results, options), "ranges": ranges, "models": models, "results": results}
 
 
 def _tried(work: Work, *task: Any) -> dict[str, Any]:
@@ -399,106 +407,156 @@ def _judged(
 # -- the report
 
 
-def rows(results: list[dict[str, Any]]) -> list[Row]:
+SHOWN = {
+    ("pendulum", "swing_up"): ("Pendulum, swing up: success", "success", 100.0, "%"),
+    ("arm", "follow"): ("Arm, figure of eight: error", "error_m", 1e3, "mm"),
+    ("arm", "fast"): ("Arm, time to stay within 1 cm", "settled_s", 1.0, "s"),
+    ("so101", "follow"): ("SO-101, figure of eight: error", "error_m", 1e3, "mm"),
+    ("so101", "fast"): ("SO-101, time to stay within 1 cm", "settled_s", 1.0, "s"),
+    ("go2", "walk"): ("Go2, velocity steps with pushes: error", "error_m_s", 1.0, "m/s"),
+}
+"""Robot and task -> what tables and the figure show: label, figure of a deployment, factor, unit."""
+UNLEARNT = 0.1
+"""A training whose best seed succeeds less often than this at its end, in its own simulation, has not learnt."""
+Results = list[dict[str, Any]]
+
+
+def rows(results: Results, options: argparse.Namespace) -> list[Row]:
     """Return the figures of each robot, task and way; each is a mean over the seeds' means, with the seeds' ends."""
     lines = []
     for name, task in dict.fromkeys((r["robot"], r["task"]) for r in results):
-        of = {w: [r for r in results if (r["robot"], r["task"], r["way"]) == (name, task, w)] for w in WAYS}
-        means: dict[tuple[str, str], dict[int, float]] = {}
-        for way, found in ((way, found) for way, found in of.items() if found):
-            prefix = f"pays/{name}/{task}/{way}"
-            good = [t["success"] for r in found for t in r["trials"]]
-            if task == "follow":  # a share of the time, not of the deployments
-                lines.append(row(f"{prefix}/success", four_digits(float(np.mean(good))), "share of the time"))
-            else:
-                value, low, high = share(round(sum(good)), len(good))
-                about = f"95 %: {low:.3f} to {high:.3f}"
-                lines.append(row(f"{prefix}/success", four_digits(value), f"of {len(good)} deployments", about))
-            energy = (("energy_j", 1.0, "energy_j", "J"),) * ("energy_j" in found[0]["trials"][0])
-            for key, factor, label, unit in (*FIGURES[task], *energy):
-                by_seed = {r["unit"]: factor * float(np.nanmean([t[key] for t in r["trials"]])) for r in found}
-                means[way, key] = by_seed
-                ends = f"{len(by_seed)} seeds: {min(by_seed.values()):.4g} to {max(by_seed.values()):.4g}"
-                mean = four_digits(float(np.mean(list(by_seed.values()))))
-                lines.append(row(f"{prefix}/{label}", mean, unit, ends))
-            lines.append(row(f"{prefix}/train_s", four_digits(float(np.mean([r["train_s"] for r in found]))), "s"))
-        if task in GOALS:
-            lines += ratios(f"pays/{name}/{task}", means, *GOALS[task])
+        these = [r for r in results if (r["robot"], r["task"]) == (name, task)]
+        trained = ", ".join(f"{way} {sum(r['way'] == way for r in these)}" for way in options.ways)
+        of = common(these, options.ways)
+        seeds = sorted({r["unit"] for r in of})
+        about = f"seeds {', '.join(map(str, seeds)) or 'none'}; trained: {trained}"
+        lines.append(row(f"pays/{name}/{task}/seeds", len(seeds), f"of {options.units}", about, "all"))
+        for way in options.ways if seeds else ():
+            lines += _rows_of_a_way(f"pays/{name}/{task}/{way}", task, [r for r in of if r["way"] == way])
+        if task in GOALS and seeds:
+            lines += ratio(f"pays/{name}/{task}", of, *GOALS[task])
     return lines
 
 
-def ratios(prefix: str, means: Mapping[tuple[str, str], Mapping[int, float]], key: str, goal: str) -> list[Row]:
+def _rows_of_a_way(prefix: str, task: str, found: Results) -> list[Row]:
+    lines = []
+    good = [t["success"] for r in found for t in r["trials"]]
+    if task == "follow":  # a share of the time, not of the deployments
+        lines.append(row(f"{prefix}/success", four_digits(float(np.mean(good))), "share of the time"))
+    else:
+        value, low, high = share(round(sum(good)), len(good))
+        about = f"95 %: {low:.3f} to {high:.3f}"
+        lines.append(row(f"{prefix}/success", four_digits(value), f"of {len(good)} deployments", about))
+    energy = (("energy_j", 1.0, "energy_j", "J"),) * ("energy_j" in found[0]["trials"][0])
+    for key, factor, label, unit in (*FIGURES[task], *energy):
+        means = [factor * mean_of(r, key) for r in found]
+        ends = f"{len(means)} seeds: {min(means):.4g} to {max(means):.4g}"
+        lines.append(row(f"{prefix}/{label}", four_digits(float(np.mean(means))), unit, ends))
+    lines.append(row(f"{prefix}/train_s", four_digits(float(np.mean([r["train_s"] for r in found]))), "s"))
+    return lines
+
+
+def common(results: Results, ways: Iterable[str]) -> Results:
+    """Return the results of those seeds of a task that were trained in all ways."""
+    by_way = [{r["unit"] for r in results if r["way"] == way} for way in ways]
+    seeds = set.intersection(*by_way) if by_way else set()
+    return [r for r in results if r["unit"] in seeds]
+
+
+def mean_of(result: Mapping[str, Any], key: str) -> float:
+    """Return the mean of a figure over a policy's deployments, without those that have none."""
+    return float(np.nanmean([np.nan if t[key] is None else t[key] for t in result["trials"]]))
+
+
+def ratio(prefix: str, results: Results, key: str, goal: str) -> list[Row]:
     """Return the figure of ``posterior`` over that of the better one of ``data_sheet`` and ``wide``."""
-    there = {way: means[way, key] for way in WAYS if (way, key) in means}
-    others = {way: float(np.mean(list(there[way].values()))) for way in NOMINAL if way in there}
-    if "posterior" not in there or not others:
+    means = {way: {r["unit"]: mean_of(r, key) for r in results if r["way"] == way} for way in WAYS}
+    others = {way: float(np.mean(list(means[way].values()))) for way in NOMINAL if means[way]}
+    ours = means["posterior"]
+    if not ours or not others:
         return []
     best = min(others, key=lambda way: others[way])
-    ours = there["posterior"]
     value = float(np.mean(list(ours.values()))) / others[best]
-    by_seed = [ours[unit] / there[best][unit] for unit in sorted(set(ours) & set(there[best]))]
-    better = sum(ratio < 1.0 for ratio in by_seed)
+    by_seed = [ours[unit] / means[best][unit] for unit in sorted(ours)]
+    better = sum(r < 1.0 for r in by_seed)
     about = f"over {best}; better with {better} of {len(by_seed)} seeds, {min(by_seed):.2f} to {max(by_seed):.2f}"
     return [row(f"{prefix}/identified_over_best", four_digits(value), "", about, goal)]
 
 
-TASKS = {
-    ("pendulum", "swing_up"): ("pendulum, swing up: success", "success", 100.0, "%"),
-    ("arm", "follow"): ("arm, figure of eight: error", "error_mm", 1.0, "mm"),
-    ("arm", "fast"): ("arm, time to stay within 1 cm", "settled_s", 1.0, "s"),
-    ("so101", "follow"): ("SO-101, figure of eight: error", "error_mm", 1.0, "mm"),
-    ("so101", "fast"): ("SO-101, time to stay within 1 cm", "settled_s", 1.0, "s"),
-    ("go2", "walk"): ("Go2, velocity steps with pushes: error", "error_m_s", 1.0, "m/s"),
-}
-"""Robot and task -> what a table and a figure show: label, row, factor, unit."""
+def _compared(report: Report) -> dict[tuple[str, str], dict[str, Results]]:
+    """Return the results that are compared: robot and task -> way -> results."""
+    ways = report["flags"]["ways"]
+    found = {}
+    for of in SHOWN:
+        these = common([r for r in report["results"] if (r["robot"], r["task"]) == of], ways)
+        found[of] = {way: [r for r in these if r["way"] == way] for way in ways}
+    return {of: by_way for of, by_way in found.items() if all(by_way.values())}
 
 
-def _shown(reports: tuple[Report, ...]) -> dict[tuple[str, str], dict[str, Row]]:
-    """Return the rows that are shown: robot and task -> way -> row."""
-    found = {line["name"]: line for report in reports for line in report["rows"]}
-    return {
-        of: ways
-        for of, (_, figure, _, _) in TASKS.items()
-        if (ways := {w: found[n] for w in WAYS if (n := f"pays/{'/'.join(of)}/{w}/{figure}") in found})
-    }
-
-
-def table(*reports: Report) -> str:
+def table(report: Report) -> str:
     """Return the table: a row for each robot and task, the four ways, and identification over the better of others."""
-    ratio = {}
-    for report in reports:
-        ratio |= {n: v for n, v in values(report, "pays/").items() if n.endswith("identified_over_best")}
+    found, lines = values(report, "pays/"), []
+    compared = _compared(report)
+    for (name, task), by_way in compared.items():
+        label, key, factor, unit = SHOWN[name, task]
+        cells = []
+        for way in WAYS:
+            means = [factor * mean_of(r, key) for r in by_way.get(way, ())]
+            ends = f"{min(means):.3g} to {max(means):.3g}" if means else ""
+            cells.append(f"{np.mean(means):.3g} {unit} ({ends})" if means else "")
+        over = found.get(f"{name}/{task}/identified_over_best")
+        cells.append("" if over is None else f"{over:.2f}, goal {GOALS[task][1]}")
+        lines.append((label, f"{found[f'{name}/{task}/seeds']} of {report['flags']['units']}", *cells))
+    head = ("hidden robots", "seeds", *WAYS.values(), "the last over the better of the first two")
+    text = markdown(head, lines)
+    if missing := [SHOWN[of][0] for of in SHOWN if of not in compared and f"{'/'.join(of)}/seeds" in found]:
+        text += f"\nNo seed was trained in all ways in the time that there was: {'; '.join(missing)}.\n"
+    return text
+
+
+def units(report: Report) -> str:
+    """Return the table of single robots in ``follow``: the delay, what was identified, and the error of each way."""
+    results = {(r["robot"], r["unit"], r["way"]): r for r in report["results"] if r["task"] == "follow"}
     lines = []
-    for of, ways in _shown(reports).items():
-        label, _, factor, unit = TASKS[of]
-        cells = [_cell(ways.get(way), factor, unit) for way in WAYS]
-        over = ratio.get(f"{'/'.join(of)}/identified_over_best")
-        lines.append((label, *cells, "" if over is None else f"{over:.2f}"))
-    return markdown(("hidden robots", *WAYS.values(), "the last over the better of the first two"), lines)
+    for model in report["models"]:
+        name, unit = model["robot"], model["unit"]
+        identified = sum(v for n, v in model["values"].items() if n in DELAYS)
+        cells = []
+        for way in WAYS:
+            result = results.get((name, unit, way))
+            mark = " \\*" if result and unlearnt(result) else ""
+            cells.append(f"{1e3 * mean_of(result, 'error_m'):.1f}{mark}" if result else "")
+        delay = f"{1e3 * model['hidden']['round_trip_s']:.0f} ms"
+        label = SHOWN[name, "follow"][0].partition(",")[0]
+        lines.append((f"{label} {unit}", delay, f"{1e3 * identified:.0f} ms, {model['verdict']}", *cells))
+    head = ("hidden robot", "round trip", "identified", *(f"{about} [mm]" for about in WAYS.values()))
+    about = f"its success in simulation was below {100 * UNLEARNT:.0f} %"
+    return f"{markdown(head, lines)}\n\\* The training had not learnt the task: {about}.\n"
 
 
-def _cell(line: Row | None, factor: float, unit: str) -> str:
-    if line is None:
-        return ""
-    ends = line["yardstick"].rpartition(": ")[2]
-    ends = " to ".join(f"{factor * float(end):.3g}" for end in ends.split(" to ")) if " to " in ends else ends
-    return f"{factor * line['value']:.3g} {unit} ({ends})"
+def unlearnt(result: Mapping[str, Any]) -> bool:
+    """Return whether a training had not learnt its task at its end."""
+    last = result.get("in_simulation", [])[-1:]
+    return bool(last) and last[0] < UNLEARNT
 
 
-def figure(*reports: Report) -> Figure:
-    """Return README's figure: each robot and task with the four ways, and the ends of seeds or of the interval."""
-    shown = _shown(reports)
-    drawn = Figure((8.2, 2.6), layout="constrained")
-    for axes, (of, ways) in zip(drawn.subplots(1, len(shown), squeeze=False)[0], shown.items(), strict=True):
-        label, _, factor, unit = TASKS[of]
-        for i, (way, line) in enumerate(ways.items()):
-            low, high = (factor * float(end) for end in line["yardstick"].rpartition(": ")[2].split(" to "))
-            value = factor * line["value"]
-            axes.bar(i, value, 0.7, yerr=[[value - low], [high - value]], capsize=3, label=WAYS[way], color=f"C{i}")
-        name, _, what = label.partition(", ")
-        axes.set(title=f"{name}\n{what} [{unit}]", xticks=[], ylim=(0, None))
-        axes.title.set_fontsize(8)
+def figure(report: Report) -> Figure:
+    """Return README's figure: the mean of each robot, task and way, and the single seeds."""
+    compared = _compared(report)
+    drawn = Figure((5.2, 0.5 + 1.25 * len(compared)), layout="constrained")  # readable at the width of a telephone
+    for axes, (of, by_way) in zip(drawn.subplots(len(compared), squeeze=False)[:, 0], compared.items(), strict=True):
+        label, key, factor, unit = SHOWN[of]
+        for i, (way, found) in enumerate(by_way.items()):
+            means = [factor * mean_of(r, key) for r in found]
+            color = "C0" if way in IDENTIFIED else "0.65"
+            axes.barh(i, np.mean(means), 0.7, color=color, alpha=0.6)
+            for value, result in zip(means, found, strict=True):
+                axes.plot(value, i, "o", ms=4, color="black", mfc="white" if unlearnt(result) else "black")
+            mean = f"{np.mean(means):#.2g}".rstrip(".")
+            axes.text(1.02, i, f"{mean} {unit}", transform=axes.get_yaxis_transform(), va="center")
+        axes.set_yticks(range(len(by_way)), [WAYS[way] for way in by_way])
+        axes.set(xlim=(0, None))
+        axes.set_title(f"{label}, {len(next(iter(by_way.values())))} robots", loc="left", fontsize=9)
+        axes.invert_yaxis()
         axes.spines[["top", "right"]].set_visible(False)
-    handles, labels = drawn.axes[0].get_legend_handles_labels()
-    drawn.legend(handles, labels, loc="outside lower center", ncols=2)
     return drawn
