@@ -4,6 +4,7 @@ import importlib
 import json
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -14,7 +15,8 @@ sys.path.insert(0, str(ROOT / "scripts"))
 import bench  # noqa: E402
 import canary  # noqa: E402
 import figures  # noqa: E402
-from benches.rows import missed, row, text_of  # noqa: E402
+from benches import pays  # noqa: E402
+from benches.rows import missed, row, text_of, values  # noqa: E402
 
 PROCESSES = ("arm", "demo", "so101")
 """Benches that start robots or keep deadlines on the wall clock."""
@@ -93,6 +95,26 @@ def test_goals():
     assert not any(missed(row("a", value, "s", "", goal)) for goal, value in met)
     assert all(missed(row("a", value, "s", "", goal)) for goal, value in not_met)
     assert missed(row("a", 19, "of 20", "", "all"))
+
+
+def test_ways_to_train_are_compared_on_the_seeds_that_all_of_them_have():
+    """The data sheet's second seed would double its error; ``fast`` has no seed in both ways."""
+    errors = {("follow", "data_sheet"): [0.01, 0.03], ("follow", "posterior"): [0.004], ("fast", "posterior"): [1.0]}
+    results = []
+    for (task, way), of_seeds in errors.items():
+        for unit, value in enumerate(of_seeds):
+            trials = [{"success": 1.0, "error_m": value, "settled_s": value, "overshoot_m": None}]
+            results.append({"robot": "arm", "task": task, "way": way, "unit": unit, "train_s": 1.0, "trials": trials})
+    options = SimpleNamespace(ways=["data_sheet", "posterior"], units=2)
+    lines = pays.rows(results, options)
+    found = values({"rows": lines}, "pays/arm/")
+    assert (found["follow/data_sheet/error_mm"], found["follow/identified_over_best"]) == (10.0, 0.4)
+    assert (found["follow/seeds"], found["fast/seeds"]) == (1, 0)
+    assert not any(name.startswith("fast/posterior") for name in found)
+    assert sum(map(missed, lines)) == 2
+    text = pays.table({"rows": lines, "results": results, "flags": vars(options)})
+    assert "10 mm" in text
+    assert "Arm, time" in text.rpartition("|")[2]
 
 
 def test_canary():
