@@ -1,0 +1,32 @@
+"""A delay that is 8 ms too long imitates an inertia: the loss of an arm has a second minimum there."""
+
+import numpy as np
+import pytest
+
+from sim2real.identification.config import FitConfig
+from sim2real.identification.fit import fit
+from sim2real.identification.segments import Span
+from sim2real.stages.config import RecordConfig
+from sim2real.stages.load import load_robot
+from sim2real.stages.session.excitation import excitation
+from sim2real.stages.session.simulated_log import simulate
+
+TRUTH = {"actuator_delay": 0.02, "gain": 2.8, "damping": 0.252, "armature": 0.0056,
+         "friction_pan": 0.045, "friction_shoulder": 0.057, "friction_elbow": 0.036}  # fmt: skip
+COUNT_RAD = 2 * np.pi / 4096
+
+
+def test_a_fit_that_begins_near_the_second_minimum_ends_in_the_first():
+    robot = load_robot("arm")
+    model = robot.identifiable(0.06)
+    signal = robot.drive.around(excitation(RecordConfig(duration_s=12.0, amplitude=0.8), robot.rate_hz, 3))
+    config = FitConfig(generations=0, max_delay_s=0.06)  # without a search, descents alone
+    values = {p.name: p.nominal for p in model.parameters} | TRUTH | {"sensor_delay": 0.0}
+    episode = simulate(model, robot, signal, values, config)
+    readings = episode.outputs["sensor"]
+    readings["position"] = np.round(readings["position"] / COUNT_RAD) * COUNT_RAD
+    table = model.parameters.with_fixed({"sensor_delay": 0.0, "payload": 0.0})
+    spans = [Span(0, begin_s) for begin_s in np.arange(0.0, 10.5, 1.3)]
+    found = fit(model, [episode], spans, 1.3, config, table).values
+    assert found["actuator_delay"] == pytest.approx(TRUTH["actuator_delay"], abs=1.5e-3)
+    assert found["armature"] == pytest.approx(TRUTH["armature"], rel=0.1)
