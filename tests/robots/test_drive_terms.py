@@ -168,7 +168,7 @@ def played(problem, terms):
 def test_both_engines_say_the_same(engines, one):
     own = ON if one == "all" else OFF | {what: ON[what] for what in TERMS[one]}
     found = played(engines.c, own)
-    np.testing.assert_allclose(found, played(engines.compiled, own), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(found, played(engines.compiled, own), rtol=0, atol=3e-6)  # float32
     assert np.abs(found - played(engines.c, OFF)).max() > 1e-3
 
 

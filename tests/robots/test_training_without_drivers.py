@@ -21,6 +21,7 @@ print(json.dumps([n for n in sys.modules if n.startswith("sim2real.hardware.") a
 SAFETY = ("", ".safety", ".safety.limits", ".safety.following")
 TABLES = (
     *SAFETY,
+    ".device",  # the interface of a device
     ".bus",
     ".bus.registers",
     *(f".{f}{m}" for f in ("dynamixel", "feetech") for m in ("", ".registers")),
@@ -31,5 +32,5 @@ TABLES = (
 def test_training_imports_no_driver_and_no_pyserial(name):
     done = subprocess.run([sys.executable, "-c", SCRIPT, name], capture_output=True, text=True, timeout=240)
     assert done.returncode == 0, done.stderr
-    # Limits and tables of registers are no drivers.
+    # Limits, tables of registers and the interface of a device are no drivers.
     assert set(json.loads(done.stdout.splitlines()[-1])) <= {f"sim2real.hardware{name}" for name in TABLES}
