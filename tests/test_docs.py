@@ -130,7 +130,8 @@ def test_the_python_of_a_page_runs(page, tmp_path, monkeypatch, request, virtual
         assert cli.main(["info", "walker"]) == 0
         assert load_robot("walker").model.needs_gpu
     if page == "docs/tutorial.md":
-        (tmp_path / "pipelines" / "head" / "head.xml").write_text((ROOT / page).read_text().split("```xml\n")[1].split("```")[0])
+        xml = (ROOT / page).read_text().split("```xml\n")[1].split("```")[0]
+        (tmp_path / "pipelines" / "head" / "head.xml").write_text(xml)
     names = {"__name__": "page", "folder": tmp_path}
     for number, block in blocks:
         for large, small in SMALLER.get(page, {}).items():

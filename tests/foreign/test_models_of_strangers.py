@@ -171,7 +171,7 @@ AXIS = f"""<mujoco><option gravity="0 0 0"/><worldbody><body>{SLIDE}<geom size="
 RAIL = AXIS.format('<body><joint name="arm" axis="0 1 0"/><geom size=".1" pos=".2 0 0" mass="1"/></body>')
 UNITS = {
     "gain": ("N m", "N"), "damping": ("N m s/rad", "N s/m"), "armature": ("kg m^2", "kg"), "frictionloss": ("N m", "N"),
-    "kp": ("N m/rad", "N/m"), "kd": ("N m s/rad", "N s/m"), "speed": ("rad/s", "m/s"), "torque": ("N m", "N"),
+    "kp": ("N m/rad", "N/m"), "kd": ("N m s/rad", "N s/m"), "torque": ("N m", "N"),
     "zero": ("rad", "m"), "play": ("rad", "m"), "drag": ("N m s^2/rad^2", "N s^2/m^2"), "static": ("N m", "N"),
     "stribeck_rad_s": ("rad/s", "m/s"), "load": ("1", "1"), "tilt_x": ("rad", "rad"),
 }  # fmt: skip
