@@ -179,7 +179,9 @@ def fit(
 
 
 def _at_other_delays(problem: Problem, found: Refined, report: OnProgress | None) -> Refined:
-    """Return the best of the minima half a period of the commands away from the one found, and of those beside them.
+    """Return the minimum that descents from other delays lead to if it is lower; else the one that was found.
+
+    They begin half a period of the commands below and above it, and again beside each lower minimum.
 
     A longer delay imitates an inertia: an arm's loss had a second minimum 7 ms above its delay of 20 ms, behind a
     ridge, with a fifth less armature.

@@ -145,7 +145,7 @@ def check(case, held, same):
         for e, rolled in enumerate(each[name]):
             count = min(len(rolled), timeline.vertices[name].count[e])
             # A compiled graph ends with the shortest episode, and before it with what nobody hears any more.
-            assert count > 0
+            assert count > 0.25 * timeline.vertices[name].count.min() - 1
             same(made[name][e, :count], rolled[:count])
 
 
