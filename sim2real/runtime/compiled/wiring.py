@@ -296,6 +296,12 @@ def check_fit(nodes: Mapping[str, BaseNode], timeline: Timeline, replayed: Mappi
                 "consumed in order",
                 hint="make timelines with draw() or Timeline.from_episode()",
             )
+        unsent = np.arange(edge.seq_in.shape[1]) >= timeline.vertices[edge.sender].count[:, None]
+        if (unsent & (edge.seq_in >= 0)).any():
+            raise UsageError(
+                f"input {input_name!r} of node {name!r} consumes messages of steps that {edge.sender!r} does not make",
+                hint="an episode that ends earlier has other edges too: sim2real.graph.rules.consumer",
+            )
 
 
 def _check_replayed(name: str, recorded: PyTree, timeline: Timeline) -> None:
