@@ -111,7 +111,6 @@ class Log:
         dropped: Samples that must not be imported.
         range_rad: Angle of 100 percent [rad].
         places: Column of each joint in arrays of commands without names.
-        turn: Node -> a turn in the unit of its angles.
         marks: What else is odd about it.
     """
 
@@ -129,7 +128,6 @@ class Log:
     dropped: set = field(default_factory=set)
     range_rad: float = 0.0
     places: tuple = ()
-    turn: dict = field(default_factory=dict)
     marks: list = field(default_factory=list)
 
 
@@ -198,7 +196,6 @@ def _write(log, written, commanded, vendor, rng):
     written, commanded = (
         np.round(x) if u == "counts" else x for x, u in zip((written, commanded), log.units, strict=True)
     )
-    log.turn = {n: 2 * np.pi * per_rad[u] for n, u in zip(("sensor", "actuator"), log.units, strict=True)}
     suffix = [SUFFIX[u] if say else "" for u, say in zip(log.units, told, strict=True)]
     order = rng.permutation(n)
     log.named = bool(vendor or rng.random() < 0.6)

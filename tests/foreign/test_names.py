@@ -54,16 +54,15 @@ def test_a_unit_that_no_name_has_is_asked_however_small_or_large_the_motion(tmp_
     np.testing.assert_allclose(episode.outputs["sensor"]["position"], np.radians(degrees * Q), atol=1e-6)
 
 
-@pytest.mark.parametrize("factor", [1.0, 180 / np.pi])
 @pytest.mark.parametrize(
     ("goal", "q", "asked"), [("goal_{}_rad", "q_{}", "sensor"), ("goal_{}", "q_{}_rad", "actuator")]
 )
+@pytest.mark.parametrize("factor", [1.0, 8.0])
 def test_a_unit_of_one_side_holds_for_the_other_unless_the_data_contradict_it(tmp_path, goal, q, asked, factor):
-    path = table(tmp_path, goal, q)
-    named, unnamed = (GOAL, Q) if asked == "sensor" else (Q, GOAL)
-    columns = {"t_s": T} | {(goal if named is GOAL else q).format(j): named[:, i] for i, j in enumerate("ab")}
-    columns |= {(q if named is GOAL else goal).format(j): factor * unnamed[:, i] for i, j in enumerate("ab")}
-    found = proposed(csv(path, columns))
+    scale = {"sensor": (1.0, factor), "actuator": (factor, 1.0)}[asked]
+    columns = {"t_s": T} | {goal.format(j): scale[0] * GOAL[:, i] for i, j in enumerate("ab")}
+    columns |= {q.format(j): scale[1] * Q[:, i] for i, j in enumerate("ab")}
+    found = proposed(csv(tmp_path / "run.csv", columns))
     assert {key[:1] + key[2:] for key in found.questions} == ({(asked, "unit")} if factor > 1 else set())
     assert found.mapping.nodes["sensor"].fields["position"].unit == "rad"
 

@@ -21,16 +21,14 @@ def answered(log, mapping, questions):
         if key == "unit":
             factor = float(log.range_rad) / 100 if unit == "percent" else 1.0
             unit = {"counts": "counts:4096", "percent": "rad"}.get(unit, unit)
-            turn = float(log.turn[node]) if "turns" in log.marks else 0.0
-            how = msgspec.structs.replace(how, unit=unit, scale=factor, turn=turn)
+            how = msgspec.structs.replace(how, unit=unit, scale=factor)
         elif key == "scale":
             how = msgspec.structs.replace(how, scale=tuple((log.sign * np.asarray(how.scale)).tolist()))
         else:
             assert key == "source", key
             how = msgspec.structs.replace(how, source=tuple(f"{how.source}[:,{i}]" for i in log.places))
         fields = dict(nodes[node].fields) | {field: how}
-        drops = {"implausible": "drop"} if node == "sensor" and "glitches" in log.marks else {}
-        nodes[node] = msgspec.structs.replace(nodes[node], fields=fields, **drops)
+        nodes[node] = msgspec.structs.replace(nodes[node], fields=fields)
     return msgspec.structs.replace(mapping, nodes=nodes)
 
 

@@ -113,26 +113,42 @@ def test_samples_are_cut_off_and_time_starts_again(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("policy", "spoil", "kept"),
+    ("reason", "spoil", "kept"),
     [
-        ({"missing": "drop"}, {"q": (8, np.nan), "t": (20, np.nan)}, [8, 20]),
-        ({"repeated": "first"}, {"t": (5, 4)}, [5]),
-        ({"implausible": "drop"}, {"q": (30, 90.0)}, [30]),
+        ("without a number", {"q": (8, np.nan), "t": (20, np.inf)}, [8, 20]),
+        ("repeated stamp", {"t": (5, 4)}, [5]),
+        ("leap away and back", {"q": (30, 90.0)}, [30]),
     ],
 )
-def test_policies_drop_samples_and_count_them(tmp_path, policy, spoil, kept):
+def test_samples_that_cannot_be_used_are_left_out_and_counted(tmp_path, reason, spoil, kept):
     signals = {"t": STAMPS_US / 1e6, "q": Q.copy()}
     for name, (row, value) in spoil.items():
         signals[name][row] = signals[name][value] if name == "t" and value == 4 else value
     file = foreign_files.npz(tmp_path / "run.npz", **signals)
     fields = {"position": {"source": "q", "unit": "rad"}}
-    wanted = mapping(actuator={"stamps": None, "rate_hz": 50.0}, sensor={"fields": fields, **policy})
+    wanted = mapping(actuator={"stamps": None, "rate_hz": 50.0}, sensor={"fields": fields})
     episode = import_file(file, wanted)
     np.testing.assert_array_equal(episode.outputs["sensor"]["position"], np.delete(Q, kept, axis=0))
-    assert episode.metadata["source"]["dropped"] == {"actuator": {}, "sensor": {next(iter(policy)): len(kept)}}
-    assert facts(episode)["dropped"] == {"sensor": len(kept)}
-    with pytest.raises(UsageError, match="sensor"):
-        import_file(file, mapping(actuator={"stamps": None, "rate_hz": 50.0}, sensor={"fields": fields}))
+    assert episode.metadata["source"]["dropped"] == {"actuator": {}, "sensor": {reason: len(kept)}}
+    assert facts(episode)["left out"] == {f"sensor, {reason}": len(kept)}
+
+
+def test_two_streams_that_share_a_table_lack_numbers_in_turn(tmp_path):
+    odd = np.arange(COUNT) % 2 == 1
+    file = foreign_files.npz(tmp_path / "run.npz", u=np.where(odd, U, np.nan), q=np.where(odd[:, None], np.nan, Q))
+    episode = import_file(file, mapping())
+    np.testing.assert_array_equal(episode.outputs["actuator"]["action"], U[odd, None])
+    np.testing.assert_array_equal(episode.steps["sensor"].start, STAMPS_US[~odd])
+
+
+@pytest.mark.parametrize("unit", ["rad", "deg", "counts:65536"])
+def test_turns_are_counted_and_said(tmp_path, unit):
+    angle, factor = 0.4 * np.arange(COUNT), {"rad": 1.0, "deg": 180 / np.pi, "counts:65536": 32768 / np.pi}[unit]
+    file = foreign_files.npz(tmp_path / "run.npz", q=factor * (angle % (2 * np.pi)))
+    wanted = mapping(sensor={"fields": {"position": {"source": "q", "unit": unit}}})
+    episode = import_file(file, wanted)
+    np.testing.assert_allclose(episode.outputs["sensor"]["position"], angle, atol=1e-9)
+    assert facts(episode)["turns are counted"] == "sensor.position"
 
 
 def test_the_log_reads_back_as_the_episode(file, tmp_path):
@@ -223,9 +239,9 @@ def spoilt(values, index, value):
         ({"t": spoilt(STAMPS_US / 1e6, 17, 0.3)}, ["do not increase", "sample 16 at", "sample 17 at 0.3 s"]),
         ({"t": STAMPS_US / 1e15}, ["do not increase", "sample 0 at", "stamp_unit is 's'"]),
         ({"t": STAMPS_US * 1e12}, ["centuries away", "stamp_unit is 's'"]),
-        ({"t": spoilt(STAMPS_US / 1e6, 4, np.nan)}, ["stamps 't' of node 'actuator'", "sample 4", "nan"]),
-        ({"u": spoilt(U, 31, np.nan)}, ["field actuator.action", "sample 31", "nan", "--samples"]),
-        ({"q": spoilt(Q, (8, 1), np.inf)}, ["field sensor.q", "sample 8", "inf"]),
+        ({"t": STAMPS_US // 200_000 / 5}, ["do not increase", "sample 0 at"]),
+        ({"u": np.full(COUNT, np.nan)}, ["actuator", "complete"]),
+        ({"q": spoilt(Q, (slice(3, 9), 1), np.nan)}, ["field sensor.q", "6 of 50 samples"]),
         ({"u": np.array(["a"] * COUNT)}, ["'u'", "words"]),
         ({"u": np.ones(COUNT, complex)}, ["'u'", "complex"]),
         ({"u": np.array([{}] * COUNT)}, ["'u'", "Python objects"]),

@@ -43,8 +43,8 @@ class Finding:
     """A sentence on the data of one joint, or of all.
 
     Attributes:
-        kind: ``order``, ``sign``, ``slope``, ``lag``, ``copy``, ``clock``, ``zero``, ``rate``, ``scale``, ``still`` or
-            ``follows``.
+        kind: ``order``, ``sign``, ``slope``, ``lag``, ``copy``, ``clock``, ``overlap``, ``zero``, ``rate``, ``scale``,
+            ``still`` or ``follows``.
         joint: Number of the joint; -1 for all.
     """
 
@@ -64,7 +64,7 @@ class JointMeasures:
     goal: float  # level of a goal that is held; NaN of one that moves
     level: float  # of the position
     r: float = 0.0  # correlation with the goal, at the best lag after it
-    slope: float = 1.0  # of the position over the goal at this lag
+    slope: float = 1.0  # of the position over the goal, or over its opposite if it follows this better
     misfit: float = 0.0  # error of the goal as a prediction, over the spread of the position
     against: float = 0.0  # correlation with the opposite of the goal, negative
     mirror: float = 0.0  # error of the opposite goal as a prediction
@@ -131,10 +131,10 @@ JOINT_CHECKS = (
     _Check("lag", "refuse", lambda m: m.best < _FOLLOWS_R and m.leads, _LEADS),
     _Check("follows", "warn", lambda m: m.best < _FOLLOWS_R,
            "{m.name} does not follow its goal (r {m.best:.2f} at most): sign, unit and order are not checked"),
+    # A weak servo stays far behind its goal, but no servo goes far beyond it.
+    _Check("slope", "refuse", lambda m: not 0.15 < m.slope < 4.0, _SLOPE),
     _Check("sign", "refuse", lambda m: m.sign < 0,
            "{m.name} moves against its goal (r {m.against:.2f}): a sign of scale is wrong"),
-    # A weak servo stays far behind its goal, but no servo goes far beyond it.
-    _Check("slope", "refuse", lambda m: m.sign > 0 and not 0.15 < m.slope < 4.0, _SLOPE),
     _Check("slope", "ask", lambda m: m.sign > 0 and not 0.5 < m.slope < 1.6, _SLOPE),
     _Check("lag", "refuse", lambda m: m.leads, _LEADS),
     _Check("sign", "ask", lambda m: m.sign == 0,
@@ -143,6 +143,7 @@ JOINT_CHECKS = (
 """What the measures of a joint show: the first check that holds counts; none holds of a joint that follows its goal."""
 
 _HINTS = {
+    "overlap": "stamp_offset of the commands adds seconds to their clock, in a mapping",
     "sign": "change the sign of that joint's scale, such as scale = [1, -1]",
     "order": "list the sources in the order of the positions",
     "copy": "log the commands that were sent, not the measurements",
@@ -180,8 +181,8 @@ def check(
     """
     found = respond(t_s, goal, position, acting)
     if found is None:
-        text = "goals and positions overlap in fewer than 50 samples: nothing is checked"
-        return [Finding("still", -1, text, "refuse")]
+        text = "the stamps of goals and positions overlap in fewer than 50 samples: nothing is checked"
+        return [Finding("overlap", -1, text, "refuse")]
     copies = copied(*t_s, goal, position)
     measures = [_measure(found, i, names, by_name, bool(copies[i]), goal, position) for i in range(len(names))]
     findings: list[Finding] = []
@@ -310,7 +311,8 @@ def _measure(found: Response, i: int, names: Sequence[str], by_name: bool, copie
         return JointMeasures(names[i], copied, moves, held, level)
     begin_s = -1.5 * found.sample_s
     r, lag_s, slope = found.best(i, i, 1.0, begin_s)
-    against, *_ = found.best(i, i, -1.0, begin_s)
+    against, _, mirrored = found.best(i, i, -1.0, begin_s)
+    slope = slope if r > -against else -mirrored
     lead_r, lead_s, _ = found.best(i, i, 1.0, _LAGS_S[0])
     misfit, mirror = found.misfit(i, i, 1.0, r), found.misfit(i, i, -1.0, against)
     # Compare with the goals of other joints, apart from those that equal its own, or its opposite.

@@ -26,6 +26,9 @@ _MAX_TICKS = 2**53  # 285 years [us]: whole numbers up to here are exact in floa
 _WALL_CLOCK = 10**15
 # With a first stamp up to here [us], stamps count from the recording's start; otherwise time 0 is the first sample.
 _OWN_START = 1_000_000
+_MOST_LACKING = 0.05
+"""A field of a node may lack numbers in this share of the samples in which the node's first field has one."""
+_MOST_REPEATED = 0.1
 
 
 @dataclass
@@ -36,16 +39,18 @@ class _Stream:
         fields: Field -> values in the log's unit, shape ``(N, ...)``, or ``()`` for a constant.
         stamps: Shape ``(N,)``, as recorded; None without any.
         rows: The numbers of the selected samples in the file.
-        dropped: Policy -> number of samples that it dropped.
+        turning: Fields with angles that jumped at the end of a turn.
+        dropped: Reason -> number of samples that were left out.
     """
 
     fields: dict[str, np.ndarray]
     stamps: np.ndarray | None
     rows: np.ndarray
+    turning: set[str]
     dropped: Counter[str]
 
-    def keep(self, good: np.ndarray, policy: str) -> None:
-        self.dropped[policy] += int((~good).sum())
+    def keep(self, good: np.ndarray, reason: str) -> None:
+        self.dropped[reason] += int((~good).sum())
         self.rows = self.rows[good]
 
 
@@ -57,9 +62,10 @@ def import_file(
     Each sample becomes a step that starts and ends at the sample's time stamp. Recorded stamps are rounded to
     microseconds. If the first one is within 1 s after 0, time 0 is that of the file; otherwise time 0 is the first
     sample. Without recorded stamps, they are generated from the node's rate; stamps of a LeRobot data set that are
-    ``frame_index / fps`` count as generated. The episode's metadata has ``stamps``
-    (node -> ``recorded`` or ``generated``), ``pipeline``, ``source``, ``graph``, ``mapping`` and
-    ``versions``.
+    ``frame_index / fps`` count as generated. Turns of angles that jump at the end of a turn are counted. Samples that
+    lack a number, repeat the stamp before, or leap away and back are left out. The episode's metadata has ``stamps``
+    (node -> ``recorded`` or ``generated``), ``pipeline``, ``source`` (with the counts of what was left out), ``graph``,
+    ``mapping`` and ``versions``.
 
     Args:
         mapping: The mapping from signals to fields, or the mapping file.
@@ -68,7 +74,7 @@ def import_file(
 
     Raises:
         UsageError: When the file or the mapping cannot be read, they do not fit each other, the signals of a node
-            differ in length, a sample is not finite, or stamps do not increase.
+            differ in length, a gain lacks most of its numbers, a position jumps, or stamps do not increase.
     """
     chosen = mapping if isinstance(mapping, ImportMapping) else load_mapping(mapping)
     tables = open_tables(Path(path), episode)
@@ -90,7 +96,7 @@ def import_table(table: Table, mapping: ImportMapping, samples: slice | None = N
         name: {f: _samples(table, name, f, how, streams[name]) for f, how in node.fields.items()}
         for name, node in mapping.nodes.items()
     }
-    _align_turns(mapping, outputs, ticks)
+    _align_turns(mapping, streams, outputs, ticks)
     # Move time 0 to the file's zero or the first sample.
     recorded = [name for name, own in streams.items() if own.stamps is not None]
     begin = min((int(ticks[name][0]) for name in recorded), default=0)
@@ -106,6 +112,7 @@ def import_table(table: Table, mapping: ImportMapping, samples: slice | None = N
         "first_sample": first,
         "time_zero_us": zero,
         "dropped": {name: {p: n for p, n in own.dropped.items() if n} for name, own in streams.items()},
+        "turns": [f"{name}.{field}" for name, own in streams.items() for field in sorted(own.turning)],
     }
     return Episode(
         steps={name: _steps(t) for name, t in ticks.items()},
@@ -167,14 +174,16 @@ def write_log(path: str | Path, episode: Episode, mapping: ImportMapping) -> Non
 
 def facts(episode: Episode) -> dict[str, Json]:
     """Return the summary of an import."""
-    dropped = {n: sum(by.values()) for n, by in episode.metadata["source"]["dropped"].items() if by}
+    source = episode.metadata["source"]
+    dropped = {f"{n}, {why}": count for n, by in source["dropped"].items() for why, count in by.items()}
     return {
-        "source": episode.metadata["source"]["file"],
+        "source": source["file"],
         "seconds": episode.duration_s,
         "samples": {name: len(steps) for name, steps in episode.steps.items()},
         "rate [Hz]": {name: node["rate_hz"] for name, node in episode.metadata["graph"].items()},
         "stamps": episode.metadata["stamps"],
-        **({"dropped": dropped} if dropped else {}),
+        **({"left out": dropped} if dropped else {}),
+        **({"turns are counted": ", ".join(source["turns"])} if source["turns"] else {}),
     }
 
 
@@ -183,7 +192,8 @@ def facts(episode: Episode) -> dict[str, Json]:
 
 def _stream(table: Table, name: str, node: NodeMapping) -> _Stream:
     """Read a node's signals, all of the same length."""
-    fields = {field: _field(table, name, field, how) for field, how in node.fields.items()}
+    turning: set[str] = set()
+    fields = {field: _field(table, name, field, how, turning) for field, how in node.fields.items()}
     stamps = None if node.stamps is None else table.signal(node.stamps)
     if stamps is not None and stamps.ndim != 1:
         raise UsageError(
@@ -205,16 +215,23 @@ def _stream(table: Table, name: str, node: NodeMapping) -> _Stream:
     count = next(iter(lengths.values()))
     if not count:
         raise UsageError(f"node {name!r} has no samples in {table.path}", hint="check that the file is complete")
-    return _Stream(fields, stamps, np.arange(count), Counter())
+    return _Stream(fields, stamps, np.arange(count), turning, Counter())
 
 
-def _field(table: Table, node: str, field: str, how: FieldMapping) -> np.ndarray:
-    """Return a field's values in the log's unit; several sources are stacked along the last axis."""
+def _field(table: Table, node: str, field: str, how: FieldMapping, turning: set[str]) -> np.ndarray:
+    """Return a field's values in the log's unit; several sources are stacked along the last axis.
+
+    Args:
+        turning: Gets the field if turns were counted.
+    """
     parts = [table.signal(source) for source in how.sources]
+    factor, unit = in_si(how.unit)
     for source, part in zip(how.sources, parts, strict=True):
-        # Jumps by 2^16 or 2^32 are counts that were read with the wrong sign, whatever their unit.
-        for column in part.reshape(len(part), -1).T if part.ndim and how.log_unit == "rad" and not how.turn else ():
-            if (modulus := checks.unsigned(column)) is not None:
+        # Jumps by 2^16 or 2^32 are counts that were read with the wrong sign, unless they are a turn.
+        for column in part.reshape(len(part), -1).T if part.ndim and unit == "rad" else ():
+            modulus = checks.unsigned(column)
+            turns = factor * np.abs(np.asarray(how.scale)) * (modulus or 0) / checks.TURN_RAD
+            if modulus is not None and not np.isclose(turns, 1.0, atol=0.01).any():
                 raise UsageError(
                     f"{source} in {table.path} jumps by {modulus}: signed counts that were read as unsigned, or counts "
                     f"beyond {modulus.bit_length() - 1} bits",
@@ -228,9 +245,6 @@ def _field(table: Table, node: str, field: str, how: FieldMapping) -> np.ndarray
             f"the sources of field {node}.{field} differ in shape: {shapes}", hint="stack signals of one length"
         ) from None
     values = raw.astype(np.float64)
-    if how.turn and values.ndim:
-        # Count turns over all samples, so that a part of a file has the same turns as the whole.
-        values = checks.counted(values.reshape(len(values), -1), how.turn).reshape(values.shape)
     scale, offset = (np.squeeze(x) if np.size(x) == 1 else np.asarray(x) for x in (how.scale, how.offset))
     for key, numbers in (("scale", scale), ("offset", offset)):
         if numbers.ndim and numbers.shape != values.shape[values.ndim > 0 :]:
@@ -239,9 +253,14 @@ def _field(table: Table, node: str, field: str, how: FieldMapping) -> np.ndarray
                 hint="give one number, or one for each column",
             )
     scaled = scale * values + offset
-    factor, _ = in_si(how.unit)
-    kept = raw.dtype if raw.dtype.kind == "f" and not how.turn else np.float64
-    return (scaled if factor == 1.0 else factor * scaled).astype(kept)
+    scaled = scaled if factor == 1.0 else factor * scaled
+    # A robot with hinges and slides has no unit. Count over all samples: a part of a file has the turns of the whole.
+    if scaled.ndim and (unit == "rad" or (not unit and field in ("position", "goal"))):
+        counted = checks.counted(scaled.reshape(len(scaled), -1), checks.TURN_RAD).reshape(scaled.shape)
+        if not np.array_equal(counted, scaled, equal_nan=True):
+            turning.add(field)
+            return counted
+    return scaled.astype(raw.dtype if raw.dtype.kind == "f" else np.float64)
 
 
 def _cut(table: Table, streams: Mapping[str, _Stream], samples: slice | None) -> int:
@@ -270,26 +289,38 @@ def _cut(table: Table, streams: Mapping[str, _Stream], samples: slice | None) ->
 
 
 def _select(table: Table, name: str, node: NodeMapping, own: _Stream) -> None:
-    """Drop the samples that the node's policies drop, and refuse positions that no joint can have."""
-    series = [v for v in (*own.fields.values(), own.stamps) if v is not None and v.ndim]
-    whole = np.logical_and.reduce([np.isfinite(v).reshape(len(v), -1).all(axis=1) for v in series])
-    if node.missing == "drop":
-        own.keep(whole[own.rows], "missing")
-    if node.repeated == "first" and own.stamps is not None and len(own.rows):
+    """Leave out samples that lack a number, repeat a stamp or leap; refuse positions that no joint can have."""
+    whole = {field: _finite(v)[own.rows] for field, v in own.fields.items() if v.ndim}
+    everywhere = np.ones(len(own.rows), bool)
+    good = np.logical_and.reduce([everywhere, *whole.values()])
+    # Two streams in one table lack numbers in turn. A gain that is written rarely would cost most of the goals.
+    first = next(iter(whole.values()), everywhere)
+    if (first & ~good).sum() > _MOST_LACKING * max(first.sum(), 1):
+        field = min(whole, key=lambda name: whole[name].sum())
+        lacking = int((~whole[field]).sum())
+        raise UsageError(
+            f"field {name}.{field} in {table.path} has no number in {lacking} of {len(good)} samples",
+            hint="remove the field from the mapping, or fill its column",
+        )
+    if own.stamps is not None:
+        good &= np.isfinite(own.stamps[own.rows])
+    own.keep(good, "without a number")
+    if own.stamps is not None and len(own.rows):
         stamps = own.stamps[own.rows]
-        own.keep(np.concatenate([[True], stamps[1:] != stamps[:-1]]), "repeated")
+        fresh = np.concatenate([[True], stamps[1:] != stamps[:-1]])
+        if fresh.mean() > 1 - _MOST_REPEATED:  # more of them are stamps that are too coarse
+            own.keep(fresh, "repeated stamp")
     for field, how in node.fields.items():
         named = meaning(field)
         if named.quantity == "position" and named.side != "command" and how.log_unit == "rad":
-            _plausible(table, name, field, node, own)
+            _keep_plausible(table, name, field, node, own)
 
 
-def _plausible(table: Table, name: str, field: str, node: NodeMapping, own: _Stream) -> None:
-    """Drop samples whose positions leap away and back.
+def _keep_plausible(table: Table, name: str, field: str, node: NodeMapping, own: _Stream) -> None:
+    """Leave out samples whose positions leap away and back.
 
     Raises:
-        UsageError: When such samples are not to be dropped, when angles jump at the end of a turn without counting, or
-            change faster than a joint can move.
+        UsageError: When positions jump farther than a joint can move, and stay there.
     """
     what, values = f"field {field} of node {name} in {table.path}", own.fields[field]
     t_s = own.rows / (node.rate_hz or 1.0)
@@ -298,38 +329,26 @@ def _plausible(table: Table, name: str, field: str, node: NodeMapping, own: _Str
     if not values.ndim or len(own.rows) < 3 or not (np.isfinite(t_s).all() and (np.diff(t_s) > 0).all()):
         return  # the check of stamps raises the better error
     angle = values[own.rows].reshape(len(own.rows), -1).astype(np.float64)
-    if not np.isfinite(angle).all():
-        return
-    if not node.fields[field].turn and (over := (checks.counted(angle, checks.TURN_RAD) != angle).any(axis=0)).any():
-        raise UsageError(
-            f"column {int(over.argmax())} of {what} jumps by 2 pi at the end of a turn",
-            hint="turn = 6.283185307179586 (360 for degrees) beside the field's source in the mapping counts them",
-        )
-    leapt = checks.glitches(t_s, angle)
-    if leapt.any() and node.implausible == "refuse":
-        k, i = (int(x[0]) for x in np.nonzero(leapt))
-        raise UsageError(
-            f"column {i} of {what} reads {angle[k, i]:.4g} rad in sample {own.rows[k]}: it leaps away and back, "
-            f"faster than a joint can, in {int(leapt.any(axis=1).sum())} samples",
-            hint='implausible = "drop" in the mapping skips such samples',
-        )
-    good = np.asarray(~leapt.any(axis=1))
+    good = np.asarray(~checks.glitches(t_s, angle).any(axis=1))
     # A jump without return means another zero, another unit or missing samples.
     if (jump := checks.leap(t_s[good], angle[good])) is not None:
         k, i, size = jump
         raise UsageError(
             f"column {i} of {what} changes by {size:.4g} rad before sample {own.rows[good][k]}, within "
             f"{t_s[good][k] - t_s[good][k - 1]:.3g} s: a joint cannot, so its zero or its unit has changed",
-            hint="cut the file there with --samples A:B, or omit this joint",
+            hint="cut the file there with --samples A:B, correct the unit, or omit this joint",
         )
-    own.keep(good, "implausible")
+    own.keep(good, "leap away and back")
 
 
 def _samples(table: Table, name: str, field: str, how: FieldMapping, own: _Stream) -> np.ndarray:
     """Return the selected samples of a field, shape ``(N, ...)``; a constant is repeated."""
     values = own.fields[field]
     values = values[own.rows] if values.ndim else np.broadcast_to(values, own.rows.shape)
-    _check_finite(table, f"field {name}.{field}", values, own.rows)
+    if not values.size or not np.isfinite(values).all():
+        raise UsageError(
+            f"field {name}.{field} has no finite number in {table.path}", hint="check the file, or remove the field"
+        )
     shape = values.shape[1:] if how.shape is None else how.shape
     if shape != (-1,) and np.prod(shape, dtype=int) != np.prod(values.shape[1:], dtype=int):
         raise UsageError(
@@ -348,7 +367,6 @@ def _ticks(table: Table, name: str, node: NodeMapping, own: _Stream) -> np.ndarr
     stamps = own.stamps[own.rows]
     what = f"stamps {node.stamps!r} of node {name!r}"
     hint = f"stamp_unit is {node.stamp_unit!r}; available: {', '.join(STAMP_UNITS)}"
-    _check_finite(table, what, stamps, own.rows)
     nanoseconds = STAMP_UNITS[node.stamp_unit]
     if not len(stamps):
         raise UsageError(f"no sample of node {name!r} in {table.path} is complete", hint="check its columns")
@@ -369,20 +387,24 @@ def _ticks(table: Table, name: str, node: NodeMapping, own: _Stream) -> np.ndarr
 
 
 def _align_turns(
-    mapping: ImportMapping, outputs: Mapping[str, dict[str, np.ndarray]], ticks: Mapping[str, np.ndarray]
+    mapping: ImportMapping,
+    streams: Mapping[str, _Stream],
+    outputs: Mapping[str, dict[str, np.ndarray]],
+    ticks: Mapping[str, np.ndarray],
 ) -> None:
     """Shift commands to the turn of their positions, as turns are counted from the start of each signal."""
     angles = [
-        (name, field, how)
+        (name, field)
         for name, node in mapping.nodes.items()
         for field, how in node.fields.items()
         if how.log_unit in ("rad", "")  # without a unit where a robot has hinges and slides
     ]
     positions = [a for a in angles if meaning(a[1]).quantity == "position" and meaning(a[1]).side != "command"]
-    for name, field, how in positions:
-        for other, goal, its in angles:
+    for name, field in positions:
+        for other, goal in angles:
             a, b = outputs[name][field], outputs[other][goal]
-            if meaning(goal).side != "command" or not (how.turn or its.turn):
+            has_turns = field in streams[name].turning or goal in streams[other].turning
+            if meaning(goal).side != "command" or not has_turns:
                 continue
             if a.shape[1:] != b.shape[1:] or min(len(a), len(b)) < 2:
                 continue
@@ -392,14 +414,9 @@ def _align_turns(
             outputs[other][goal] = turned.reshape(b.shape)
 
 
-def _check_finite(table: Table, what: str, values: np.ndarray, rows: np.ndarray) -> None:
-    finite = np.isfinite(values).reshape(len(values), -1).all(axis=1)
-    if not finite.all():
-        k = int(np.argmin(finite))
-        raise UsageError(
-            f"{what} is no finite number in sample {rows[k]} of {table.path}: {values[k]}",
-            hint='cut it off with --samples A:B, or write missing = "drop" into the mapping, which skips such samples',
-        )
+def _finite(values: np.ndarray) -> np.ndarray:
+    """Return whether all numbers of a sample are finite, ``(N,)``."""
+    return np.isfinite(values).reshape(len(values), -1).all(axis=1)
 
 
 def _steps(ticks: np.ndarray) -> Steps:

@@ -52,7 +52,6 @@ class FieldMapping(_Table, frozen=True):
         scale: The field is ``scale * signal + offset``; one number, or one for each column.
         offset: See ``scale`` [the field's unit]; one number, or one for each column.
         shape: Shape of one sample; None: as in the file; ``(-1,)``: a vector, of a number one of length 1.
-        turn: A turn in the signal's unit, to count turns of angles that jump at its end; 0: no counting.
     """
 
     source: str | tuple[str, ...]
@@ -60,7 +59,6 @@ class FieldMapping(_Table, frozen=True):
     scale: float | tuple[float, ...] = 1.0
     offset: float | tuple[float, ...] = 0.0
     shape: tuple[int, ...] | None = None
-    turn: float = 0.0
 
     def __post_init__(self) -> None:
         if not self.sources or not all(self.sources):
@@ -70,8 +68,6 @@ class FieldMapping(_Table, frozen=True):
             numbers = value if isinstance(value, tuple) else (value,)
             if not numbers or not all(map(math.isfinite, numbers)):
                 raise ValueError(f"{key} must be a finite number, or a list of them, got {value}")
-        if not 0.0 <= self.turn < math.inf:
-            raise ValueError(f"turn must be above 0, such as 360 for degrees, got {self.turn}")
         if self.shape not in (None, (-1,)) and not all(n > 0 for n in self.shape or ()):
             raise ValueError(f"shape must be whole numbers above 0, or [-1] for a vector, got {list(self.shape or ())}")
         if not self.unit.isprintable():
@@ -98,10 +94,7 @@ class NodeMapping(_Table, frozen=True):
         stamp_unit: Unit of the recorded stamps.
         order: Order of messages with equal stamps: those of nodes with a lower number are first; None: commands
             (of a node ``actuator``) come after samples, as they were computed from them.
-        missing: Policy for samples that lack a number.
-        repeated: Policy for samples with the stamp of the one before: ``first`` keeps the first.
         stamp_offset: Added to the recorded stamps, for a stream with its own clock [s].
-        implausible: Policy for samples whose positions leap away and back.
     """
 
     fields: Mapping[str, FieldMapping]
@@ -109,10 +102,7 @@ class NodeMapping(_Table, frozen=True):
     stamps: str | None = None
     stamp_unit: Literal["s", "ms", "us", "ns"] = "s"
     order: int | None = None
-    missing: Literal["refuse", "drop"] = "refuse"
-    repeated: Literal["refuse", "first"] = "refuse"
     stamp_offset: float = 0.0
-    implausible: Literal["refuse", "drop"] = "refuse"
 
     def __post_init__(self) -> None:
         if not self.fields:

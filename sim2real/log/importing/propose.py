@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,6 +42,7 @@ _RATES_HZ = (5.0, 12_000.0)
 """Usual sampling rates of recorders."""
 _WALL_S = (1e9, 4e9)
 """Wall clocks read this many seconds since 1970 (2001 to 2096)."""
+
 _APART_S = 0.02
 """Two clocks of one topic that disagree by more are a question."""
 
@@ -100,6 +101,7 @@ class Proposal:
         self.reasons: dict[Key, str] = {}
         self.questions: dict[Key, str] = {}
         self.evidence = [*table.notes, *notes]
+        self.unnamed: tuple[str, str] | None = None  # node and field whose unit is that of the other side
 
     def toml(self) -> str:
         """Return the text of the mapping file."""
@@ -127,7 +129,6 @@ class Proposal:
         # Their clocks, units, and what goes along.
         sides = {"actuator": command, "sensor": measured}
         clocks = {node: self.clock(signal, node) for node, signal in sides.items()}
-        self.require_overlap(clocks["sensor"][1], clocks["actuator"][1])
         kind = command.meaning.quantity or "position"
         goal = _FIELDS[kind]
         fields: dict[str, dict[str, FieldMapping]] = {"actuator": {}, "sensor": {}}
@@ -138,17 +139,32 @@ class Proposal:
             unit = {"velocity": "rad/s", "torque": "N m", "voltage": "V"}.get(kind, "")
             fields["actuator"][goal] = command.mapped(unit)
             self.reasons["actuator", goal, "source"] = f"commands {kind}, by its name"
-        units, inferred = self.units(angles)
-        for (node, name), signal in angles.items():
-            fields[node][name] = self.angle((node, name), signal, units[node, name])
+        units = {at: self.unit(signal) for at, signal in angles.items()}
+        known = {unit for unit, _ in units.values() if unit}
+        for at, signal in angles.items():
+            if not any(units[at]) and len(known) == 1:
+                self.unnamed = at
+                units[at] = next(iter(known)), "as of the other side: its own name has none"
+            fields[at[0]][at[1]] = self.angle(at, signal, *units[at])
         self.add_extras(command, measured, places, fields)
         self.add_velocities(command, measured, places, fields, clocks)
         nodes = {node: NodeMapping(self.in_lengths(fields[node]), **clocks[node][0]) for node in sides}
         self.mapping = ImportMapping(self.hints.pipeline, nodes)
         self.evidence += about_torque({n: msgspec.to_builtins(node) for n, node in nodes.items()})
         self.add_unused()
-        lacking = {n for n, s in sides.items() if not (np.isfinite(s.values).all() and np.isfinite(clocks[n][1]).all())}
-        self.check(by_name, inferred, lacking)
+        if not self.questions:
+            try:
+                episode = import_table(self.table, self.mapping)
+            except UsageError as error:
+                if self.unnamed is None:
+                    raise
+                self.ask_unit(str(error).partition("\n")[0])
+                return
+            source = episode.metadata["source"]
+            for node, counts in source["dropped"].items():
+                self.evidence += [f"{node}: left out {n} samples: {why}" for why, n in counts.items()]
+            self.evidence += [f"turns of {field} are counted" for field in source["turns"]]
+            self.weigh(checks.check_episode(episode, self.joints, by_name), fields["actuator"].get("goal"))
 
     # -- positions, commands, and their joints
 
@@ -299,38 +315,7 @@ class Proposal:
         self.questions[node, "", "rate_hz"] = f"?  # samples per second: {why}; --rate-hz answers, too"
         return {"rate_hz": 1.0}, np.arange(float(count))
 
-    def require_overlap(self, t: np.ndarray, c: np.ndarray) -> None:
-        """Ask for the offset of two clocks if the streams hardly overlap."""
-        t, c = t[np.isfinite(t)], c[np.isfinite(c)]
-        if len(t) and len(c) and min(t[-1], c[-1]) - max(t[0], c[0]) < 0.5 * min(np.ptp(t), np.ptp(c)):
-            self.questions["actuator", "", "stamp_offset"] = (
-                f"{t[0] - c[0]:.6g}?  # stamps of commands and positions hardly overlap: seconds to add to commands"
-            )
-
     # -- units
-
-    def units(
-        self, angles: Mapping[tuple[str, str], Signal]
-    ) -> tuple[dict[tuple[str, str], str], list[tuple[str, str]]]:
-        """Return the units of positions and goals, empty for a question, and the fields whose unit no name has."""
-        found = {at: self.unit(signal) for at, signal in angles.items()}
-        known = {unit for unit, _ in found.values() if unit}
-        units, inferred = {}, []
-        for at, (unit, reason) in found.items():
-            if not unit and not reason and len(known) == 1:
-                (unit,) = known
-                reason = f"as the {'goals' if at[0] == 'sensor' else 'positions'}: its own name has none"
-                inferred.append(at)
-            units[at] = unit
-            if unit:
-                self.reasons[(*at, "unit")] = reason
-            else:
-                span = (np.nanmax(angles[at].values, axis=0) - np.nanmin(angles[at].values, axis=0)).max()
-                choices = reason or '"rad" or "deg"?'
-                self.questions[(*at, "unit")] = (
-                    f"{choices}  # it spans up to {span:.4g}, and its name has no unit; --unit answers, too"
-                )
-        return units, inferred
 
     def unit(self, signal: Signal) -> tuple[str, str]:
         """Return a signal's unit by flag, name or kind of file, and the reason; or no unit, and candidates if known."""
@@ -357,7 +342,7 @@ class Proposal:
                 return unit, "whole counts by LeRobot's calibration"
             return "", '"deg" or "hundredths" (with --calibration)?'
         key = (signal.whole or signal.sources[0]).lower()
-        if self.table.format == "mcap" or re.search(r"joint_?states?|field\.(position|header)", key):
+        if self.table.format == "mcap" or re.search(r"joint_?(state|command)s?|field\.(position|header)", key):
             return "rad", "messages of ROS are in radians"
         if re.search(r"qpos|dof_?pos", key):
             return "rad", "MuJoCo and Isaac are in radians"
@@ -366,18 +351,20 @@ class Proposal:
             return "", '"m" or "mm"?' if only else '"rad" (and m) or another?'
         return "", ""
 
-    def angle(self, at: tuple[str, str], signal: Signal, unit: str) -> FieldMapping:
-        """Return the field of positions or goals: by LeRobot's calibration, and with a turn if they jump at its end."""
+    def angle(self, at: tuple[str, str], signal: Signal, unit: str, reason: str) -> FieldMapping:
+        """Return the field of positions or goals in a unit or by LeRobot's calibration; ask without a unit."""
+        if unit:
+            self.reasons[(*at, "unit")] = reason
+        else:
+            span = (np.nanmax(signal.values, axis=0) - np.nanmin(signal.values, axis=0)).max()
+            choices = reason or '"rad" or "deg"?'
+            self.questions[(*at, "unit")] = (
+                f"{choices}  # it spans up to {span:.4g}, and its name has no unit; --unit answers, too"
+            )
         if self.hints.calibration is not None and unit in lerobot.UNITS:
             scale, offset = lerobot.conversion(self.hints.calibration, signal.labels, unit)
             return signal.mapped("rad", scale=tuple(scale), offset=tuple(offset))
-        factor, si = in_si(unit)
-        turn = 2 * np.pi / factor
-        rows = signal.values[np.isfinite(signal.values).all(axis=1)]
-        if si != "rad" or np.array_equal(checks.counted(rows, turn), rows):
-            return signal.mapped(unit)
-        self.reasons[(*at, "turn")] = "it jumps at the end of a turn: turns are counted"
-        return signal.mapped(unit, turn=turn)
+        return signal.mapped(unit)
 
     def in_lengths(self, fields: Mapping[str, FieldMapping]) -> dict[str, FieldMapping]:
         """Return fields with the units of slides: lengths, or none where a robot has hinges and slides."""
@@ -437,7 +424,7 @@ class Proposal:
                 continue
             # Its unit is that of its name, else that of the positions; the data must agree.
             unit = f"{s.meaning.unit or how.unit}/s"
-            angle = in_si(how.unit)[0] * (checks.counted(of.values, how.turn) if how.turn else of.values)
+            angle = checks.counted(in_si(how.unit)[0] * of.values, checks.TURN_RAD)
             if checks.is_rate(clocks[node][1], angle, in_si(unit)[0] * v.values):
                 fields[node][name] = v.mapped(unit)
                 self.reasons[node, name, "unit"] = f"it is the rate of {of.name!r}"
@@ -460,60 +447,18 @@ class Proposal:
 
     # -- what the data say
 
-    def check(self, by_name: bool, inferred: Sequence[tuple[str, str]], lacking: Container[str]) -> None:
-        """Give the mapping the policies that the data need; refuse or ask what the data contradict.
-
-        Args:
-            by_name: Whether names say which goal belongs to which position.
-            inferred: Fields whose unit is that of the other side.
-            lacking: Nodes whose positions, commands or stamps lack a number in some samples; a gain that lacks one is
-                refused, as most of the commands could be dropped with it.
-        """
-        goal = self.mapping.nodes["actuator"].fields.get("goal")
-        drops = {
-            name: {"implausible": "drop"}
-            | ({"missing": "drop"} if name in lacking else {})
-            | ({"repeated": "first"} if node.stamps else {})
-            for name, node in self.mapping.nodes.items()
-        }
-        try:
-            episode = import_table(self.table, self.with_policies(drops))
-        except UsageError as error:
-            # Samples that lack a number are known also where an answer is needed before the import.
-            self.mapping = self.with_policies({n: {"missing": "drop"} if n in lacking else {} for n in drops})
-            self.reasons |= {(n, "", "missing"): "samples lack a number" for n in drops if n in lacking}
-            if inferred and goal is not None and not self.questions:
-                text = str(error).partition("\n")[0]
-                self.questions[(*inferred[0], "unit")] = f'"{goal.unit}" or another?  # {text}; --unit answers, too'
-            elif not self.questions:
-                raise
-            return
-        # Keep the policies that drop something.
-        dropped = episode.metadata["source"]["dropped"]
-        self.mapping = self.with_policies({n: {p: drops[n][p] for p in counts} for n, counts in dropped.items()})
-        why = {"missing": "lack a number", "repeated": "repeat a stamp", "implausible": "leap away and back"}
-        for node, counts in dropped.items():
-            self.reasons |= {(node, "", policy): f"{n} samples {why[policy]}" for policy, n in counts.items()}
-        if not self.questions:
-            self.weigh(checks.check_episode(episode, self.joints, by_name), goal, inferred)
-
-    def with_policies(self, policies: Mapping[str, Mapping[str, str]]) -> ImportMapping:
-        nodes = {n: msgspec.structs.replace(node, **policies[n]) for n, node in self.mapping.nodes.items()}
-        return msgspec.structs.replace(self.mapping, nodes=nodes)
-
-    def weigh(
-        self, findings: Sequence[checks.Finding], goal: FieldMapping | None, inferred: Sequence[tuple[str, str]]
-    ) -> None:
+    def weigh(self, findings: Sequence[checks.Finding], goal: FieldMapping | None) -> None:
         """Refuse what contradicts the mapping, and ask what fits several mappings."""
         self.evidence += [f.text for f in findings if f.weight == "note"]
-        self.evidence += [f"warning: {f.text}" for f in findings if f.weight == "warn"]
         open_ones = [f for f in findings if f.weight in ("ask", "refuse")]
+        told = [f for f in findings if f.weight == "warn"] + (open_ones if self.hints.as_told else [])
+        self.evidence += [f"warning: {f.text}" for f in told]
         if self.hints.as_told:
-            self.evidence += [f"warning: {f.text}" for f in open_ones]
             return
-        followed = any(f.kind == "follows" and f.weight == "note" for f in findings)
+        # One line of the mapping answers these; the others are wrong in the file.
         # A joint of another scale than the others is refused by its name; if all are, their unit is open.
         keys = {"sign": "scale", "order": "source", "slope": "unit", "follows": "unit"}
+        followed = any(f.kind == "follows" and f.weight == "note" for f in findings)
         wrong = [
             f for f in open_ones if f.kind not in keys or (f.kind == "slope" and f.weight == "refuse" and followed)
         ]
@@ -527,15 +472,19 @@ class Proposal:
         candidates = {
             "scale": f"{[-x if i in against else x for i, x in enumerate(scale)]} or {scale}?",
             "source": f"{json.dumps(goal.sources)} in another order?",
-            "unit": f'"{goal.unit}" or another?',
         }
         for key in dict.fromkeys(keys[f.kind] for f in open_ones):
-            node, name = inferred[0] if inferred and key == "unit" else ("actuator", "goal")
             why = "; ".join(f.text for f in open_ones if keys[f.kind] == key)
-            self.questions[node, name, key] = f"{candidates[key]}  # {why}; --as-told keeps the file's"
-        for at in inferred if not followed else ():
-            text = f"{candidates['unit']}  # no joint moves, so nothing proves it; --unit answers, too"
-            self.questions.setdefault((*at, "unit"), text)
+            if key == "unit":
+                self.ask_unit(f"{why}; --as-told keeps it")
+            else:
+                self.questions["actuator", "goal", key] = f"{candidates[key]}  # {why}; --as-told keeps the file's"
+
+    def ask_unit(self, why: str) -> None:
+        """Ask for a unit that no name gives, or else for that of the goals."""
+        node, name = self.unnamed or ("actuator", "goal")
+        unit = self.mapping.nodes[node].fields[name].unit
+        self.questions[node, name, "unit"] = f'"{unit}" or another?  # {why}; --unit answers, too'
 
 
 def _rank(named: Meaning, side: str) -> int | None:
