@@ -7,19 +7,18 @@ import mmap
 import re
 import struct
 import warnings
-import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Header, Metadata
+from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC
 
 from sim2real.errors import Sim2RealError, UsageError
@@ -31,32 +30,22 @@ from sim2real.log.writer import LIBRARY
 from sim2real.types import Json
 
 _PREFIX = struct.Struct("<BQ")
+# Plain integers compare faster than enum members, and every record of a chunk is compared.
+_MESSAGE, _CHANNEL = int(Opcode.MESSAGE), int(Opcode.CHANNEL)
+_BEGIN = len(MCAP0_MAGIC)
 # Sizes in a message record: opcode and length; then channel, sequence and two times.
 _MESSAGE_AT, _DATA_AT = 9, 31
-# Plain integers compare faster than enum members, and every record is compared.
-_CHUNK, _MESSAGE, _MESSAGE_INDEX, _DATA_END = (
-    int(o) for o in (Opcode.CHUNK, Opcode.MESSAGE, Opcode.MESSAGE_INDEX, Opcode.DATA_END)
-)
 # After damage, reading resumes at a chunk or at the session's end. The search looks for the name of the chunk's
 # compression, which comes after the prefix, two times, a size and a checksum, or for the name of the session's end.
 _LANDMARK = re.compile(rb"(?P<chunk>\x03\x00\x00\x00lz4|\x04\x00\x00\x00zstd)|\x0b\x00\x00\x00session_end")
 _CHUNK_NAME_AT, _METADATA_NAME_AT = 37, 9
-# A chunk that claims to hold more is damaged: ours hold 64 KiB, or one message.
-_MAX_CHUNK_BYTES = 1 << 28
-# Records that overlap could repeat without end: reading stops after this multiple of the file's size.
-_MAX_READ_RATIO = 4
-# Number of unreadable places with a description; a file can have millions.
-_MAX_DESCRIBED = 100
-# Exceptions of parsing damaged bytes.
-_BROKEN = (
-    *(McapError, struct.error, zlib.error, ValueError, LookupError, TypeError),
-    *(AttributeError, ArithmeticError, MemoryError, RecursionError),
-)
 # Role of a channel -> required keys of its metadata; joint states repeat the outputs and are not decoded.
 _ROLES = {"step": {"node"}, "output": {"node", "fields"}, "input": {"node", "input"}, "events": set[str]()}
 _ROLES["joint_states"] = set()
 # Positions of an event's level, and of its name before alignment [bytes].
 _LEVEL_AT, _NAME_AT = 12, 13
+_ALL = 0, 2**63
+"""All times of a log [ns]."""
 
 
 class TruncatedLogWarning(UserWarning):
@@ -76,7 +65,7 @@ class _Contents:
     library: str = ""  # that wrote the file, according to its header
     session: dict[str, Json] | None = None  # the session's metadata; None if damaged
     end: dict[str, Json] | None = None  # the metadata written at the session's end; None after a crash
-    attachments: dict[str, bytes] = field(default_factory=dict)
+    attachments: dict[str, int] = field(default_factory=dict)  # name -> size [bytes]
     epoch_ns: int = 0  # wall clock at the episode's time 0; 0 if the episode never started
     channels: dict[int, Channel] = field(default_factory=dict)
     messages: dict[int, list[bytes]] = field(default_factory=dict)  # of each channel, in the order of the file
@@ -85,26 +74,15 @@ class _Contents:
     last_log_time: int = 0  # of all chunks [ns]
     skipped: list[str] = field(default_factory=list)  # descriptions of the unreadable places
 
-    def skip(self, description: str) -> None:
-        """Add the description of an unreadable place."""
-        if len(self.skipped) < _MAX_DESCRIBED:
-            self.skipped.append(description)
-        elif len(self.skipped) == _MAX_DESCRIBED:
-            self.skipped.append("more places")
-
     def with_role(self, role: str) -> dict[int, Channel]:
         """Return the channels with a role: ``step``, ``output``, ``input`` or ``events``."""
         return {number: c for number, c in self.channels.items() if c.metadata["role"] == role}
 
-    def log_times(self, span: tuple[float | None, float | None]) -> tuple[int, int]:
-        """Return start and exclusive end of a time range [s from the episode's start] in log time [ns]."""
-        start_s, end_s = span
-        begin = 0 if start_s is None else max(0, self.epoch_ns + round(start_s * 1e6) * 1000)
-        end = 2**63 if end_s is None else max(0, self.epoch_ns + round(end_s * 1e6) * 1000)
-        return begin, end
-
-    def columns(self, channel: int, layout: Layout, span: tuple[float | None, float | None]) -> np.ndarray:
+    def columns(self, channel: int, layout: Layout, span: tuple[int, int]) -> np.ndarray:
         """Decode the messages of a channel, whose type has a fixed size.
+
+        Args:
+            span: First and exclusive last log time [ns].
 
         Returns:
             A structured array, shape ``(N,)``, ordered by sequence: ``sequence``, ``log_time`` and ``publish_time``
@@ -123,50 +101,46 @@ class _Contents:
         if any(len(m) != dtype.itemsize for m in messages):
             raise Sim2RealError(f"topic {self.channels[channel].topic} holds messages that do not fit its own fields")
         rows = np.frombuffer(b"".join(messages), dtype)
-        # Select the range, and sort by sequence, as threads can write out of order.
-        begin, end = self.log_times(span)
-        rows = rows[(rows["log_time"] >= begin) & (rows["log_time"] < end)]
+        # Sort by sequence, as threads can write out of order.
+        rows = rows[(rows["log_time"] >= span[0]) & (rows["log_time"] < span[1])]
         return rows[np.argsort(rows["sequence"], kind="stable")]
 
-    def take(self, data: mmap.mmap | bytes, record: _Record, span: tuple[float | None, float | None] | None) -> None:
-        """Add a record; of a chunk in the range its messages, and of none if the range is None."""
+    def take(self, data: mmap.mmap | bytes, record: _Record, opens_chunks: bool = True) -> None:
+        """Add a record, and the messages of a chunk if chunks are to be opened; describe a damaged one."""
         opcode, start, end = record
-        if opcode == _CHUNK:
-            self._take_chunk(data, record, span)
-        elif opcode == _MESSAGE_INDEX:
-            channel = data[start] | data[start + 1] << 8
-            self.indexed[channel] = self.indexed.get(channel, 0) + (end - start - 6) // 16
-        elif opcode == _MESSAGE and span is not None:  # some tools write messages outside of chunks
-            self._take_message(data[start - _MESSAGE_AT : end])
-        elif opcode == Opcode.CHANNEL:
-            self._take_channel(self._parsed(Channel, data, record))
-        elif opcode == Opcode.HEADER and (header := self._parsed(Header, data, record)) is not None:
-            self.library = header.library
-        elif opcode == Opcode.ATTACHMENT and (attachment := self._parsed(Attachment, data, record)) is not None:
-            self.attachments[attachment.name] = attachment.data
-        elif opcode == Opcode.METADATA and (entry := self._parsed(Metadata, data, record)) is not None:
-            if entry.name == SESSION:
-                self.session = decode(entry.metadata)
-            elif entry.name == SESSION_END:
-                self.end = decode(entry.metadata)
-
-    def _take_chunk(
-        self, data: mmap.mmap | bytes, record: _Record, span: tuple[float | None, float | None] | None
-    ) -> None:
-        self.chunks += 1
-        first, last = struct.unpack_from("<QQ", data, record.start)
-        self.last_log_time = max(self.last_log_time, last)
-        if span is None:
-            return
-        begin, end = self.log_times(span)
-        # Open the first chunk always: it repeats the channels' definitions with a checksum.
-        if self.chunks > 1 and self.channels and (last < begin or first >= end):
-            return
         try:
-            content = _decompressed(Chunk.read(_stream(data, record)))
-        except Exception as error:  # decompressors have their own exceptions
-            self.skip(f"a chunk of {record.end - record.start} bytes at {record.start} ({error})")
-            return
+            if opcode == Opcode.CHUNK:
+                self.chunks += 1
+                self.last_log_time = max(self.last_log_time, struct.unpack_from("<Q", data, start + 8)[0])
+                if opens_chunks:
+                    content, _ = get_chunk_data_stream(Chunk.read(_stream(data, record)), validate_crc=True)
+                    self._take_content(content.read(-1))
+            elif opcode == Opcode.MESSAGE_INDEX:
+                channel = data[start] | data[start + 1] << 8
+                self.indexed[channel] = self.indexed.get(channel, 0) + (end - start - 6) // 16
+            elif opcode == Opcode.MESSAGE and opens_chunks:  # some tools write messages outside of chunks
+                self._take_content(data[start - _MESSAGE_AT : end])
+            elif opcode == Opcode.CHANNEL:
+                self._take_channel(Channel.read(_stream(data, record)))
+            elif opcode == Opcode.HEADER:
+                self.library = Header.read(_stream(data, record)).library
+            elif opcode == Opcode.ATTACHMENT:
+                attachment = Attachment.read(_stream(data, record))
+                self.attachments[attachment.name] = len(attachment.data)
+            elif opcode == Opcode.METADATA:
+                entry = Metadata.read(_stream(data, record))
+                if entry.name == SESSION:
+                    self.session = decode(entry.metadata)
+                elif entry.name == SESSION_END:
+                    self.end = decode(entry.metadata)
+        except Sim2RealError:
+            raise
+        except Exception as error:  # damaged bytes raise anything, and decompressors have their own exceptions
+            name = Opcode(opcode).name.lower().replace("_", " ")
+            self.skipped.append(f"a {name} of {end - start} bytes at {start} ({error})")
+
+    def _take_content(self, content: bytes) -> None:
+        """Add the messages and channels of a chunk."""
         position, size = 0, len(content)
         while position < size:
             start = position + _PREFIX.size
@@ -174,34 +148,21 @@ class _Contents:
             if start + length > size:
                 raise ValueError("the records in a chunk do not fill it")
             if opcode == _MESSAGE:
-                self._take_message(content[position : start + length])
-            elif opcode == Opcode.CHANNEL:
-                self._take_channel(self._parsed(Channel, content, _Record(opcode, start, start + length)))
+                waiting = self.messages.get(content[start] | content[start + 1] << 8)
+                if waiting is not None:
+                    waiting.append(content[position : start + length])
+            elif opcode == _CHANNEL:
+                self._take_channel(Channel.read(_stream(content, _Record(opcode, start, start + length))))
             position = start + length
 
-    def _take_message(self, record: bytes) -> None:
-        waiting = self.messages.get(record[_MESSAGE_AT] | record[_MESSAGE_AT + 1] << 8)
-        if waiting is not None:
-            waiting.append(record)
-
-    def _take_channel(self, channel: Channel | None) -> None:
-        metadata = {} if channel is None else channel.metadata
-        needed, epoch_ns = _ROLES.get(metadata.get("role", "")), metadata.get("epoch_ns", "")
-        if channel is None or needed is None or not needed <= set(metadata):
+    def _take_channel(self, channel: Channel) -> None:
+        needed, epoch_ns = _ROLES.get(channel.metadata.get("role", "")), channel.metadata.get("epoch_ns", "")
+        if needed is None or not needed <= set(channel.metadata) or not re.fullmatch(r"[0-9]{1,19}", epoch_ns):
             return
-        if re.fullmatch(r"[0-9]{1,19}", epoch_ns):
-            self.channels[channel.id] = channel
-            self.epoch_ns = int(epoch_ns)
-            if metadata["role"] != "joint_states":
-                self.messages.setdefault(channel.id, [])
-
-    def _parsed(self, kind: Any, data: mmap.mmap | bytes, record: _Record) -> Any:
-        """Return a record parsed by a class of ``mcap.records``; None if it is damaged."""
-        try:
-            return kind.read(_stream(data, record))
-        except _BROKEN as error:
-            self.skip(f"a {kind.__name__.lower()} record at {record.start} ({error})")
-            return None
+        self.channels[channel.id] = channel
+        self.epoch_ns = int(epoch_ns)
+        if channel.metadata["role"] != "joint_states":
+            self.messages.setdefault(channel.id, [])
 
 
 def read_log(path: str | Path, start_s: float | None = None, end_s: float | None = None) -> Episode:
@@ -230,11 +191,12 @@ def read_log(path: str | Path, start_s: float | None = None, end_s: float | None
     """
     if start_s is not None and end_s is not None and not start_s <= end_s:
         raise UsageError(f"the range begins at {start_s} s, after its end at {end_s} s")
-    span = (start_s, end_s)
-    contents = _walk(path, span)
+    contents = _walk(path)
+    limits = zip((start_s, end_s), _ALL, strict=True)
+    begin, end = (ns if s is None else max(0, contents.epoch_ns + round(s * 1e6) * 1000) for s, ns in limits)
     with _readable_errors(path):
-        steps, outputs, sequences = _steps_and_outputs(contents, span)
-        messages, events = _connections(contents, span, sequences), _events(contents, span)
+        steps, outputs, sequences = _steps_and_outputs(contents, (begin, end))
+        messages, events = _connections(contents, (begin, end), sequences), _events(contents, (begin, end))
         units = _output_units(contents)
     # Steps before the first one count as lost, unless the range starts later.
     firsts = {node: int(s[0]) for node, s in sequences.items() if len(s)}
@@ -268,7 +230,7 @@ def read_session(path: str | Path) -> dict[str, Json]:
     Raises:
         Sim2RealError: As ``read_log``, and when the metadata is damaged.
     """
-    session = _walk(path).session
+    session = _walk(path, opens_chunks=False).session
     if session is None:
         raise Sim2RealError(f"the session metadata of {path} is damaged", hint="read_log still reads the data")
     return session
@@ -285,7 +247,7 @@ def summary(path: str | Path) -> dict[str, Json]:
     Raises:
         Sim2RealError: As ``read_log``.
     """
-    contents = _walk(path)
+    contents = _walk(path, opens_chunks=False)
     return {
         "bytes": Path(path).stat().st_size,
         "chunks": contents.chunks,
@@ -294,7 +256,7 @@ def summary(path: str | Path) -> dict[str, Json]:
         "complete": contents.end is not None,
         "session": contents.session,
         "session_end": contents.end,
-        "attachments": {name: len(content) for name, content in contents.attachments.items()},
+        "attachments": contents.attachments,
         "topics": {c.topic: contents.indexed.get(number, 0) for number, c in contents.channels.items()},
         "skipped": contents.skipped,
     }
@@ -330,30 +292,26 @@ class LogTail:
         Raises:
             Sim2RealError: The file is damaged, or is no log of sim2real.
         """
-        contents, position, span = self._contents, 0, (None, None)
+        contents = self._contents
         with open(self.path, "rb") as stream:
             stream.seek(self._position)
             data = stream.read()
         if self._position == 0:
-            if len(data) < len(MCAP0_MAGIC):
+            if len(data) < _BEGIN:
                 return None
             if not data.startswith(MCAP0_MAGIC):
                 raise Sim2RealError(f"{self.path} is no MCAP file")
-            position = len(MCAP0_MAGIC)
         # Take the records that are whole; the next call reads the rest again.
+        position = 0 if self._position else _BEGIN
         with _readable_errors(self.path):
-            while position + _PREFIX.size <= len(data):
-                opcode, length = _PREFIX.unpack_from(data, position)
-                start, end = position + _PREFIX.size, position + _PREFIX.size + length
-                if end > len(data) or opcode == _DATA_END:
-                    break
-                contents.take(data, _Record(opcode, start, end), span)
-                position = end
+            while (record := _record(data, position)) is not None and record.opcode != Opcode.DATA_END:
+                contents.take(data, record)
+                position = record.end
             self._position += position
             steps = contents.with_role("step")
             if not any(map(contents.messages.get, steps)):
                 return None
-            parts, outputs, _ = _steps_and_outputs(contents, span)
+            parts, outputs, _ = _steps_and_outputs(contents, _ALL)
             episode = Episode(parts, {}, outputs, contents.session or {}, complete=False, units=_output_units(contents))
         # Keep the outputs whose step records are in the next chunk: the writer writes an output before its step.
         counts = {c.metadata["node"]: len(contents.messages[n]) for n, c in steps.items()}
@@ -364,75 +322,7 @@ class LogTail:
         return episode
 
 
-def _walk(path: str | Path, span: tuple[float | None, float | None] | None = None) -> _Contents:
-    """Read a log file once.
-
-    Args:
-        span: Chunks in this range are opened for their messages; None: no chunk is opened.
-
-    Raises:
-        Sim2RealError: When the file is missing, not an MCAP file, not a log of sim2real, or cut off before the end of
-            its session metadata.
-    """
-    contents = _Contents()
-    with _readable_errors(path), _opened(path) as data:
-        for record in _records(data, contents):
-            contents.take(data, record, span)
-    # Without the session's metadata, find the reason.
-    if contents.session is None:
-        if contents.library not in ("", LIBRARY):
-            raise Sim2RealError(
-                f"{path} is an MCAP file of {contents.library!r}, not a log of sim2real",
-                hint="convert it with `sim2real import FILE`",
-            )
-        if not contents.chunks:
-            raise _cut_before_session(path)
-        contents.skip("the session's metadata")
-    return contents
-
-
-@contextmanager
-def _readable_errors(path: str | Path) -> Iterator[None]:
-    """Convert the exceptions that damaged bytes cause in the block into an error about the file."""
-    try:
-        yield
-    except Sim2RealError:
-        raise
-    except _BROKEN as error:
-        raise Sim2RealError(
-            f"the log {path} is damaged: {type(error).__name__}: {error}",
-            hint="record again; `mcap recover` of MCAP's own command-line tool may save the readable part",
-        ) from error
-
-
-@contextmanager
-def _opened(path: str | Path) -> Iterator[mmap.mmap]:
-    """Map an MCAP file into memory."""
-    path = Path(path)
-    if not path.is_file():
-        names = sorted(p.name for p in path.parent.glob("*.mcap"))
-        raise Sim2RealError(
-            f"there is no log {path}", hint=f"logs in that folder: {', '.join(names)}" if names else "check the path"
-        )
-    with open(path, "rb") as stream:
-        # An MCAP file starts with its magic bytes.
-        magic = stream.read(len(MCAP0_MAGIC))
-        if len(magic) < len(MCAP0_MAGIC) and MCAP0_MAGIC.startswith(magic):
-            raise _cut_before_session(path)
-        if magic != MCAP0_MAGIC:
-            raise Sim2RealError(
-                f"{path} is no MCAP file",
-                hint="`sim2real record` writes logs, and `sim2real import` makes one of a file of another recorder",
-            )
-        with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
-            yield data
-
-
-def _cut_before_session(path: str | Path) -> Sim2RealError:
-    return Sim2RealError(
-        f"the log {path} was cut before the end of its session metadata: it holds no data",
-        hint="the recording stopped while it was set up; record again",
-    )
+# -- steps, outputs and messages
 
 
 def _output_units(contents: _Contents) -> dict[str, dict[str, str]]:
@@ -443,7 +333,7 @@ def _output_units(contents: _Contents) -> dict[str, dict[str, str]]:
 
 
 def _steps_and_outputs(
-    contents: _Contents, span: tuple[float | None, float | None]
+    contents: _Contents, span: tuple[int, int]
 ) -> tuple[dict[str, Steps], dict[str, dict[str, np.ndarray]], dict[str, np.ndarray]]:
     """Return steps, outputs, and the number of each step, by node."""
     output_channels = {c.metadata["node"]: (n, c) for n, c in contents.with_role("output").items()}
@@ -473,7 +363,7 @@ def _steps_and_outputs(
 
 
 def _connections(
-    contents: _Contents, span: tuple[float | None, float | None], sequences: Mapping[str, np.ndarray]
+    contents: _Contents, span: tuple[int, int], sequences: Mapping[str, np.ndarray]
 ) -> dict[tuple[str, str], Messages]:
     """Return the messages of each connection, by (node, input name)."""
     connections = {}
@@ -493,13 +383,12 @@ def _connections(
     return connections
 
 
-def _events(contents: _Contents, span: tuple[float | None, float | None]) -> list[dict[str, Json]]:
+def _events(contents: _Contents, span: tuple[int, int]) -> list[dict[str, Json]]:
     events = []
-    begin, end = contents.log_times(span)
     for number in contents.with_role("events"):
         for record in contents.messages[number]:
             log_time, payload = int.from_bytes(record[15:23], "little"), record[_DATA_AT:]
-            if begin <= log_time < end:
+            if span[0] <= log_time < span[1]:
                 kind, position = read_text(payload, _NAME_AT)
                 text, _ = read_text(payload, position)
                 time_s = (log_time - contents.epoch_ns) / 1e9
@@ -521,39 +410,103 @@ def _warn(path: str | Path, contents: _Contents, missing: Mapping[str, int]) -> 
         warnings.warn(f"the log {path} is not whole: {'. '.join(problems)}", TruncatedLogWarning, stacklevel=3)
 
 
-def _records(data: mmap.mmap, contents: _Contents) -> Iterator[_Record]:
+# -- records
+
+
+def _walk(path: str | Path, opens_chunks: bool = True) -> _Contents:
+    """Read a log file once.
+
+    Raises:
+        Sim2RealError: When the file is missing, not an MCAP file, not a log of sim2real, or cut off before the end of
+            its session metadata.
+    """
+    contents = _Contents()
+    with _readable_errors(path), _opened(path) as data:
+        for record in _records(data, contents.skipped):
+            contents.take(data, record, opens_chunks)
+    # Without the session's metadata, find the reason.
+    if contents.session is None:
+        if contents.library not in ("", LIBRARY):
+            raise Sim2RealError(
+                f"{path} is an MCAP file of {contents.library!r}, not a log of sim2real",
+                hint="convert it with `sim2real import FILE`",
+            )
+        if not contents.chunks:
+            raise _cut_before_session(path)
+        contents.skipped.append("the session's metadata")
+    return contents
+
+
+@contextmanager
+def _readable_errors(path: str | Path) -> Iterator[None]:
+    """Convert the exceptions that damaged bytes cause in the block into an error about the file."""
+    try:
+        yield
+    except (Sim2RealError, OSError):
+        raise
+    except Exception as error:
+        raise Sim2RealError(
+            f"the log {path} is damaged: {type(error).__name__}: {error}",
+            hint="record again; `mcap recover` of MCAP's own command-line tool may save the readable part",
+        ) from error
+
+
+@contextmanager
+def _opened(path: str | Path) -> Iterator[mmap.mmap]:
+    """Map an MCAP file into memory."""
+    path = Path(path)
+    if not path.is_file():
+        names = sorted(p.name for p in path.parent.glob("*.mcap"))
+        raise Sim2RealError(
+            f"there is no log {path}", hint=f"logs in that folder: {', '.join(names)}" if names else "check the path"
+        )
+    with open(path, "rb") as stream:
+        # An MCAP file starts with its magic bytes.
+        magic = stream.read(_BEGIN)
+        if len(magic) < _BEGIN and MCAP0_MAGIC.startswith(magic):
+            raise _cut_before_session(path)
+        if magic != MCAP0_MAGIC:
+            raise Sim2RealError(
+                f"{path} is no MCAP file",
+                hint="`sim2real record` writes logs, and `sim2real import` makes one of a file of another recorder",
+            )
+        with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            yield data
+
+
+def _cut_before_session(path: str | Path) -> Sim2RealError:
+    return Sim2RealError(
+        f"the log {path} was cut before the end of its session metadata: it holds no data",
+        hint="the recording stopped while it was set up; record again",
+    )
+
+
+def _records(data: mmap.mmap, skipped: list[str]) -> Iterator[_Record]:
     """Yield the records of the data section without reading their content.
 
     The length of each record leads to the next one. If a length is damaged, reading resumes at the next bytes that look
-    like a chunk or the session's end.
-
-    Raises:
-        Sim2RealError: When records overlap.
+    like a chunk or the session's end, and ``skipped`` gets the place.
     """
-    position = trusted = len(MCAP0_MAGIC)
-    read = 0
+    position = trusted = _BEGIN
     while position < len(data):
         record = _record(data, position)
         if record is not None:
-            read += record.end - position
-            if read > _MAX_READ_RATIO * len(data):
-                raise Sim2RealError("the records of the file overlap, which no recorder writes")
             yield record
             position = record.end
-            if record.opcode in (_CHUNK, _MESSAGE_INDEX):
+            if record.opcode in (Opcode.CHUNK, Opcode.MESSAGE_INDEX):
                 trusted = position
-            elif record.opcode == _DATA_END:
+            elif record.opcode == Opcode.DATA_END:
                 return
             continue
         # A damaged length can lead past good chunks: search from the end of the last record that is surely whole.
         resume = _next_landmark(data, trusted)
         if resume is None:
-            break
-        contents.skip(f"{resume - trusted} bytes at {trusted}")
+            return
+        skipped.append(f"{resume - trusted} bytes at {trusted}")
         position, trusted = resume, resume + 1
 
 
-def _record(data: mmap.mmap, position: int) -> _Record | None:
+def _record(data: mmap.mmap | bytes, position: int) -> _Record | None:
     """Return the record at a position; None if there is no complete and plausible one."""
     start = position + _PREFIX.size
     if start > len(data):
@@ -563,19 +516,19 @@ def _record(data: mmap.mmap, position: int) -> _Record | None:
     if end > len(data) or not opcode:
         return None
     # Check the lengths inside of chunks and message indices, which are most of a file; check the opcode of the others.
-    if opcode == _MESSAGE_INDEX:
+    if opcode == Opcode.MESSAGE_INDEX:
         plausible = length >= 6 and length == 6 + int.from_bytes(data[start + 2 : start + 6], "little")
-    elif opcode == _CHUNK:
+    elif opcode == Opcode.CHUNK:
         plausible = _is_chunk(data, start, length)
-    elif opcode > _DATA_END:
+    elif opcode > Opcode.DATA_END:
         # Accept a private record (from 0x80 on) or one of a later format, but no chunk with a damaged opcode.
         plausible = _begins_record(data, end) and not _is_chunk(data, start, length)
     else:
-        plausible = opcode != _DATA_END or length == 4
+        plausible = opcode != Opcode.DATA_END or length == 4
     return _Record(opcode, start, end) if plausible else None
 
 
-def _begins_record(data: mmap.mmap, position: int) -> bool:
+def _begins_record(data: mmap.mmap | bytes, position: int) -> bool:
     """Return whether a record can begin at a position, or the file ends there."""
     if position + _PREFIX.size > len(data):
         return position == len(data)
@@ -583,7 +536,7 @@ def _begins_record(data: mmap.mmap, position: int) -> bool:
     return opcode > 0 and position + _PREFIX.size + length <= len(data)
 
 
-def _is_chunk(data: mmap.mmap, start: int, length: int) -> bool:
+def _is_chunk(data: mmap.mmap | bytes, start: int, length: int) -> bool:
     """Return whether the lengths inside a record's content are those of a chunk."""
     if length < 40:
         return False
@@ -601,30 +554,6 @@ def _next_landmark(data: mmap.mmap, position: int) -> int | None:
         if begin >= position and (record := _record(data, begin)) is not None and record.opcode == kind:
             return begin
     return None
-
-
-def _decompressed(chunk: Chunk) -> bytes:
-    """Return a chunk's content, of its claimed size at most; check size and checksum."""
-    size = chunk.uncompressed_size
-    if size > _MAX_CHUNK_BYTES:
-        raise ValueError(f"it claims to hold {size} bytes")
-    if chunk.compression == "lz4":
-        import lz4.frame
-
-        content = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
-    elif chunk.compression == "zstd":
-        import zstandard
-
-        content = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(size + 1)
-    elif chunk.compression == "":
-        content = chunk.data
-    else:
-        raise ValueError(f"its compression {chunk.compression!r} is unknown")
-    if len(content) != size:
-        raise ValueError(f"it holds other than the {size} bytes that it claims")
-    if chunk.uncompressed_crc and zlib.crc32(content) != chunk.uncompressed_crc:
-        raise ValueError("its checksum differs")
-    return content
 
 
 def _stream(data: mmap.mmap | bytes, record: _Record) -> ReadDataStream:

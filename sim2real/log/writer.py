@@ -54,8 +54,6 @@ SYNC_PERIOD_S = 1.0
 WAIT_S, REPORT_WAITS, STUCK_S = 0.2, 25, 60.0
 # Limit of the queue's memory [bytes], and memory of a queued record without its arrays.
 MAX_QUEUE_BYTES, RECORD_BYTES = 1 << 30, 500
-# The queue's memory is checked once in this many records, as the check takes longer than a put.
-RECORDS_PER_CHECK = 256
 # The warning level of rcl_interfaces/msg/Log.
 WARN = 30
 
@@ -363,15 +361,11 @@ class McapRecorder:
         self._file = SessionFile(self.path, metadata, attachments, outputs, inputs, joint_states or {}, units)
         # The queue between the control loops and the writer's thread: method and arguments.
         self._queue: queue.SimpleQueue[tuple[Callable[..., None], tuple[Any, ...]] | None] = queue.SimpleQueue()
-        # Memory of the arrays in each node's outputs, and the steps of each node, which one thread counts.
-        self._sizes = {
-            node: sum(np.asarray(leaf).nbytes for leaf in named_leaves(example).values())
-            for node, example in outputs.items()
-        }
-        self._queued = dict.fromkeys(outputs, 0)
-        self._written = dict.fromkeys(outputs, 0)
-        self._puts = self._done = 0
-        self._max_bytes = _max_queue_bytes()
+        sizes = [
+            sum(np.asarray(leaf).nbytes for leaf in named_leaves(example).values()) for example in outputs.values()
+        ]
+        self._most_waiting = _max_queue_bytes() // (RECORD_BYTES + max(sizes, default=0))
+        self._done = 0
         self._error: BaseException | None = None
         self._failed: Sim2RealError | None = None
         self._started = self._closed = False
@@ -402,8 +396,6 @@ class McapRecorder:
         """Queue a step that has ended, and its output: a pytree like the example, or a mapping by leaf name."""
         leaves = _snapshot(record.node, output, self._names.get(record.node, {}))
         self._put(self._file.step, record, leaves)
-        if record.node in self._queued:
-            self._queued[record.node] += 1
 
     def message(self, record: MessageRecord) -> None:
         """Queue the record of a message."""
@@ -479,18 +471,12 @@ class McapRecorder:
         if self._failed is not None:
             raise self._failed
         self._queue.put((write, arguments))
-        self._puts += 1
-        if self._puts % RECORDS_PER_CHECK == 0 and self._queue_bytes() > self._max_bytes:
+        if self.waiting > self._most_waiting:
             self._failed = Sim2RealError(
-                f"{self.waiting:,} records wait in memory, as the disk is too slow: more than "
-                f"{self._max_bytes / 1e6:.0f} MB for the log {self.path}",
+                f"{self.waiting:,} records wait in memory, as the disk is too slow for the log {self.path}",
                 hint="the log holds every record until now; record fewer or smaller outputs, at a lower rate, close "
                 "other programs on this machine, or write to a faster, local disk",
             )
-
-    def _queue_bytes(self) -> int:
-        arrays = sum(self._sizes[n] * max(0, self._queued[n] - self._written[n]) for n in self._sizes)
-        return RECORD_BYTES * self.waiting + arrays
 
     def _wait(self, report: Callable[[str], None] | None) -> None:
         """Wait until the writer has written the queue, as long as it makes progress."""
@@ -532,8 +518,6 @@ class McapRecorder:
                     write, arguments = item
                     write(*arguments)
                     self._done += 1
-                    if write == self._file.step:
-                        self._written[arguments[0].node] += 1
                 # Flush after each period, so that a crash costs little data; sync less often, as it takes longer.
                 if (now := time.monotonic()) >= flush_at:
                     self._file.flush()

@@ -416,7 +416,7 @@ def _align_turns(
 
 def _finite(values: np.ndarray) -> np.ndarray:
     """Return whether all numbers of a sample are finite, ``(N,)``."""
-    return np.isfinite(values).reshape(len(values), -1).all(axis=1)
+    return np.asarray(np.isfinite(values).reshape(len(values), -1).all(axis=1))
 
 
 def _steps(ticks: np.ndarray) -> Steps:
