@@ -24,7 +24,7 @@ _SHOWN: Mapping[str, str] = {
     "RunFlags.identify": "log terms max_delay_s",
     "RunFlags.train": "ppo",
     "RunFlags.deploy": "port episodes duration_s dry_run",
-    "RunFlags": "seed runs resume iterations until record identify train deploy",
+    "RunFlags": "seed runs resume iterations record identify train deploy",
     "RecordConfig": "port duration_s excitation amplitude seed dry_run view",
     "IdentifyConfig": "log hold_out terms bounds fix max_delay_s seed view",
     "TrainConfig": "model resume seed view ppo",

@@ -173,14 +173,12 @@ class _Iterating:
     def _after(self, run_dir: Path, folder: StageFolder) -> Plan:
         """Return the plan that follows from the newest deployment."""
         deployment = Deployment.read(folder.folder)
-        # Stop at the goal, or if no stage can improve the result.
-        if self.flags.goal and _reached(deployment, *self.flags.goal):
-            return Plan((), "stop: {} is at least {:g}".format(*self.flags.goal))
+        # Stop if the policy works, or if no stage can improve the result.
         advice = deployment.advice
         if advice is None or advice.status in ("look at this joint", "not judged"):
             reason = advice.reasons[0] if advice and advice.reasons else "the deployment was not judged"
             return Plan((), f"stop: {reason}")
-        if advice.status == "fine" and not self.flags.goal:
+        if advice.status == "fine":
             return Plan((), "stop: the policy works on the robot")
         # Train again if the model holds and the timing of the training does, too.
         seed = self._next_seed(run_dir)
@@ -245,15 +243,6 @@ class _Iterating:
         return 1 + int(training.manifest.config["seed"]) if training is not None else self.flags.train.seed
 
 
-def _reached(deployment: Deployment, quantity: str, minimum: float) -> bool:
-    """Return whether a quantity of the gap report is at least ``minimum`` on the robot."""
-    on_robot = {g.quantity: g.real for g in deployment.gap}
-    if quantity not in on_robot:
-        raise UsageError(f"there is no {quantity!r} in the gap report. Available: {', '.join(on_robot) or 'none'}")
-    real = on_robot[quantity]
-    return real is not None and real >= minimum
-
-
 def _why_insufficient(identification: Identification) -> str:
     """Return why the logs of a deployment do not suffice to identify from; "" if they do.
 
@@ -315,7 +304,6 @@ def run(
     deploy: DeployConfig | Mapping[str, Any] | None = None,
     resume: AnyPath | None = None,
     iterations: int = 1,
-    until: str | None = None,
 ) -> Run:
     """Record, identify, train and deploy, one after the other, in one run folder.
 
@@ -324,7 +312,6 @@ def run(
         record: Settings of record; default: the robot's. A dict has the settings that differ from these.
         resume: A run folder to go on with, from the first stage that is not finished there.
         iterations: Most iterations; see ``sim2real run --help``.
-        until: ``QUANTITY=VALUE`` that ends the iterations.
 
     Returns:
         The run, with the results of its stages.
@@ -341,7 +328,7 @@ def run(
         home = done.run_dir
         return done
 
-    run_all(robot, RunFlags(runs=root, resume=home, iterations=iterations, until=until, **configs), call)
+    run_all(robot, RunFlags(runs=root, resume=home, iterations=iterations, **configs), call)
     if home is None:
         raise UsageError("no stage ran")
     return Run(home)

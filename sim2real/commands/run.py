@@ -28,7 +28,7 @@ def run_command(command: str, arguments: list[str]) -> None:
     """``sim2real run PIPELINE [FLAGS]``."""
     name, rest = split_pipeline(command, arguments)
     default = RunFlags(**defaults_of(name).in_a_run)
-    examples = ("--seed 3 --record.duration-s 20", f"--resume runs/{name}/TIME", "--iterations 5 --until success=0.95")
+    examples = ("--seed 3 --record.duration-s 20", f"--resume runs/{name}/TIME", "--iterations 5")
     texts = (f"sim2real run {name}", *(f"run {name} {example}" for example in examples))
     parsed = flags.parse(default, rest, *texts)
     # The seed is the default of every stage: the seed flag of a stage overrides it.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -33,10 +32,7 @@ class RunFlags(DemoFlags):
     """Record, identify, train and deploy, one after the other."""
 
     iterations: int = 1
-    """Most iterations: the verdict on a deployment chooses the stages that run again."""
-    until: Annotated[str | None, Flag("QUANTITY=VALUE")] = None
-    """Iterate until a quantity of the gap report is at least this large on the robot, such as success=0.95; default:
-    until the verdict is 'fine'."""
+    """Most iterations: the verdict on a deployment chooses the stages that run again, until it is 'fine'."""
     record: RecordConfig = field(default_factory=RecordConfig)
     identify: IdentifyConfig = field(default_factory=IdentifyConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
@@ -49,26 +45,8 @@ class RunFlags(DemoFlags):
                 "only training is divided among processes: each of them would record and deploy",
                 hint="record and identify in one, then `sim2real train PIPELINE --hosts.found` in all",
             )
-        if self.iterations < 1 or (self.until and self.iterations == 1):
-            raise UsageError(
-                f"a run iterates at least once, and more often to reach a goal; got {self.iterations}",
-                hint="--iterations 5 --until success=0.95",
-            )
-        _ = self.goal
-
-    @property
-    def goal(self) -> tuple[str, float] | None:
-        """The quantity to reach, and its least value; None: no goal."""
-        if self.until is None:
-            return None
-        name, _, value = self.until.partition("=")
-        try:
-            least = float(value)
-        except ValueError:
-            least = math.nan
-        if not name or not math.isfinite(least):
-            raise UsageError(f"until must be QUANTITY=VALUE, got {self.until!r}", hint="--until success=0.95")
-        return name, least
+        if self.iterations < 1:
+            raise UsageError(f"a run iterates at least once, got {self.iterations}", hint="--iterations 5")
 
     def with_seed(self, seed: int | None) -> RunFlags:
         """Return the flags with one seed in every stage; None changes nothing."""

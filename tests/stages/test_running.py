@@ -109,25 +109,9 @@ def test_what_nobody_can_mend_unattended_ends_the_loop(world, status, capsys):
     assert "stop: it is loose" in capsys.readouterr().err
 
 
-def test_a_goal_goes_on_until_it_is_reached_or_the_iterations_end(world, capsys):
-    again, rows = world.go(verdict("fine", 0.92), verdict("fine", 0.93), verdict("fine", 0.96), until="success=0.95")
-    assert again == ["train", "deploy"] * 2
-    assert [r.real for r in rows] == [0.92, 0.93, 0.96]
-    assert "stop: success is at least 0.95" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("told", "said"),
-    [
-        ({"iterations": 0}, "at least once"),
-        ({"iterations": 1, "until": "success=0.9"}, "at least once"),
-        ({"iterations": 2, "until": "success"}, "QUANTITY=VALUE"),
-        ({"iterations": 2, "until": "success=high"}, "QUANTITY=VALUE"),
-    ],
-)
-def test_a_goal_that_is_none_is_refused_before_anything_moves(told, said):
-    with pytest.raises(UsageError, match=said):
-        RunFlags(**told)
+def test_a_number_of_iterations_that_is_none_is_refused():
+    with pytest.raises(UsageError, match="at least once"):
+        RunFlags(iterations=0)
 
 
 def test_a_deployment_that_does_not_say_what_it_took_is_not_repeated_for_ever(world, monkeypatch):
