@@ -514,26 +514,6 @@ def table(report: Report) -> str:
     return text
 
 
-def units(report: Report) -> str:
-    """Return the table of single robots in ``follow``: the delay, what was identified, and the error of each way."""
-    results = {(r["robot"], r["unit"], r["way"]): r for r in report["results"] if r["task"] == "follow"}
-    lines = []
-    for model in report["models"]:
-        name, unit = model["robot"], model["unit"]
-        identified = sum(v for n, v in model["values"].items() if n in DELAYS)
-        cells = []
-        for way in WAYS:
-            result = results.get((name, unit, way))
-            mark = " \\*" if result and unlearnt(result) else ""
-            cells.append(f"{1e3 * mean_of(result, 'error_m'):.1f}{mark}" if result else "")
-        delay = f"{1e3 * model['hidden']['round_trip_s']:.0f} ms"
-        label = SHOWN[name, "follow"][0].partition(",")[0]
-        lines.append((f"{label} {unit}", delay, f"{1e3 * identified:.0f} ms, {model['verdict']}", *cells))
-    head = ("hidden robot", "round trip", "identified", *(f"{about} [mm]" for about in WAYS.values()))
-    about = f"its success in simulation was below {100 * UNLEARNT:.0f} %"
-    return f"{markdown(head, lines)}\n\\* The training had not learnt the task: {about}.\n"
-
-
 def unlearnt(result: Mapping[str, Any]) -> bool:
     """Return whether a training had not learnt its task at its end."""
     last = result.get("in_simulation", [])[-1:]
