@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 NO_LIMIT = 1e6
 """Value of a limit that is absent, in its unit: no robot reaches it."""
 
-_FOLLOW = (
-    *("load", "static", "drag", "bias", "damping_bias", "back_emf", "play"),
+_TERMS = (
+    *("load", "static", "drag", "bias", "damping_bias", "back_emf", "play", "top_speed"),
     *("cogging_cos", "cogging_sin", "eccentric_cos", "eccentric_sin"),
 )
-"""Terms that follow the state unless they are 0."""
+"""Terms that take time in each step unless they are absent."""
 
 
 @pytree.dataclass
@@ -106,20 +106,25 @@ class DriveLaw:
     def among(self, values: Mapping[str, np.ndarray]) -> DriveLaw:
         """Return the law without the terms that no copy has: in numpy they take as long as a step in C."""
         law = copy.copy(self)
-        law._absent = frozenset(name for name in _FOLLOW if not np.any(values[name]))
-        if not np.any(values["top_speed"] < NO_LIMIT):
+        law._absent = frozenset(name for name in _TERMS if not np.any(values[name]))
+        if np.all(values["top_speed"] >= NO_LIMIT):
             law._absent |= {"top_speed"}
         return law
 
     def steady(
         self, values: Mapping[str, np.ndarray], control: np.ndarray
-    ) -> tuple[np.ndarray, dict[str, np.ndarray]] | None:
-        """Return the controls of all steps, and damping and friction of the model; None if a term follows the state."""
-        if any(np.any(values[name]) for name in _FOLLOW) or np.any(values["top_speed"] < NO_LIMIT):
+    ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]] | None:
+        """Return the controls of all steps, the applied forces, and damping and friction; None if a term follows."""
+        law, count = self.among(values), len(self._qvel_at)
+        same = {"bias"}
+        on = control[..., 3 * count : 4 * count]
+        if law._has("back_emf") and np.all(on == on[:, :1]):
+            same.add("back_emf")
+        if law._has(*set(_TERMS) - same):
             return None
-        still = np.zeros((1, self._size))
-        fields = self(np, values, control[:, 0], np.zeros((1, 1 + int(self._qpos_at.max()))), still)[2]
-        return control[..., : 3 * len(self._qvel_at)], fields
+        still = np.zeros((len(control), self._size))
+        _, applied, fields = law(np, values, control[:, 0], np.zeros((1, 1 + int(self._qpos_at.max()))), still)
+        return control[..., : 3 * count], applied, fields
 
     def __call__(
         self, xp: Any, values: Mapping[str, Scalar], control: Array, qpos: Array, qvel: Array

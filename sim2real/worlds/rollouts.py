@@ -83,8 +83,8 @@ class StepLaw(Protocol):
 
     def steady(
         self, values: Mapping[str, np.ndarray], control: np.ndarray
-    ) -> tuple[np.ndarray, dict[str, np.ndarray]] | None:
-        """Return the controls of all steps, and the fields; None if they follow the state.
+    ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]] | None:
+        """Return the controls of all steps, the applied forces and the fields; None if they follow the state.
 
         Without a call between the steps, C rolls out all of them at once.
 
@@ -223,11 +223,13 @@ class Rollouts:
         batch.bind("qacc_warmstart")[:count] = start.warmstart
         out = {n: np.empty((count, steps, *first.shape[1:])) for n, first in begun.items()}
         # Roll out, and keep the last physics step of each tick.
-        steady = self._law.steady(law, control) if self._law else (control, {})
+        steady = self._law.steady(law, control) if self._law else (control, 0.0, {})
         if steady:
-            for name, values in steady[1].items():
+            controls, applied, fields = steady
+            batch.bind("qfrc_applied")[:count] = applied
+            for name, values in fields.items():
                 batch.expand(name)[:count] = values
-            failed |= _failing(count, lambda: batch.rollout(steps, steady[0], record=tuple(out), ids=ids, out=out))
+            failed |= _failing(count, lambda: batch.rollout(steps, controls, record=tuple(out), ids=ids, out=out))
         elif self._law:
             failed |= self._stepwise(self._law, law, control, out)
         failed |= batch.warning[:count, :, 1].any(axis=1)
