@@ -28,7 +28,7 @@ from benches.rows import ROOT, missed, text_of
 
 BENCHES = {
     "arm": ("runs.arm", "the arm's whole run"),
-    "compose": ("compose", "control steps against dm_control, tasks on Warp against bare steps"),
+    "compose": ("compose", "a composed task on MuJoCo Warp against bare steps"),
     "demo": ("runs.demo", "the pendulum's whole run for several seeds"),
     "doctor": ("doctor", "faults of deployments that the doctor names, on robots drawn at random"),
     "drift": ("drift", "how often the drift test detects and names a change of a hidden SO-101"),

@@ -9,27 +9,23 @@ goals from target to target, as fast as a trained one may. Small steps before ea
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from benches import jobs
-from benches.hidden import robots as hidden
+from benches.hidden import arms
+from benches.hidden.robots import RATE_HZ, write_log
 from benches.rows import Report, Row, markdown, row, share
-from sim2real.emulation.plant import PlantClock, load_plant
-from sim2real.emulation.truth import TruthLog
 from sim2real.errors import Sim2RealError
-from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.safety.gate import SafetyGate
 from sim2real.stages.load import load_robot
-from sim2real.stages.session.excitation import excitation
 
 CAUSES = {"none": "", "friction": "friction", "payload": "payload", "delay": "round_trip_delay"}
 """Change of the robot -> the parameter that the verdict must name."""
@@ -39,123 +35,61 @@ TARGET_S, APPROACH_HZ = 4.0, 4.0
 """Time at each target; rate at which a goal approaches it."""
 STEP_RAD, STEP_S, STEPS = 0.12, 0.5, 8
 """Size, duration and number of the small steps that measure the delay."""
-_STEP_NS = 500_000
 QUICK = {"runs": 1, "changes": ["friction"], "generations": 5, "record_s": 12.0, "seconds": 5.0, "folds": 0}
 Policy = Callable[[int, np.ndarray], np.ndarray]
 """Number of a step, and the goals of the one before [rad] -> goals [rad]."""
 
 
-@dataclass(frozen=True)
-class HiddenArm:
-    """An SO-101.
+def draw(number: int) -> arms.HiddenArm:
+    """Draw a robot: within 20 % of the pipeline's, 10 to 28 ms late."""
+    rng = np.random.default_rng([20261124, number])
+    plant = {"gain": rng.uniform(0.8, 1.2), "friction": rng.uniform(0.8, 1.2)}
+    sensing, acting = rng.uniform(0.003, 0.010), rng.uniform(0.007, 0.018)
+    return arms.HiddenArm("so101", plant, sensing, acting, 0.15 * sensing, (0.0, 0.0), 0.0, number)
 
-    Attributes:
-        number: Its number.
-        plant: Arguments of its plant.
-        sensing_s: Mean age of a measurement [s].
-        acting_s: Mean time from a command to the motor [s].
-    """
 
-    number: int
-    plant: dict[str, Any]
-    sensing_s: float
-    acting_s: float
+def changed(arm: arms.HiddenArm, change: str) -> arms.HiddenArm:
+    """Return the robot after a change; ``none``: no change."""
+    if change == "friction":
+        return replace(arm, plant={**arm.plant, "friction": FRICTION * arm.plant["friction"]})
+    if change == "delay":
+        return replace(arm, acting=arm.acting + DELAY_S)
+    return replace(arm, load_kg=PAYLOAD_KG) if change == "payload" else arm
 
-    @staticmethod
-    def draw(number: int) -> HiddenArm:
-        """Draw a robot: within 20 % of the pipeline's, 10 to 28 ms late."""
-        rng = np.random.default_rng([20261124, number])
-        plant = {"gain": rng.uniform(0.8, 1.2), "friction": rng.uniform(0.8, 1.2)}
-        return HiddenArm(number, plant, rng.uniform(0.003, 0.010), rng.uniform(0.007, 0.018))
 
-    def changed(self, change: str) -> HiddenArm:
-        """Return the robot after a change; ``none``: no change."""
-        if change == "friction":
-            return replace(self, plant={**self.plant, "friction": FRICTION * self.plant["friction"]})
-        if change == "delay":
-            return replace(self, acting_s=self.acting_s + DELAY_S)
-        if change == "payload":
-            return replace(self, plant={**self.plant, "carried_kg": PAYLOAD_KG})
-        return self
+def play(path: Path, arm: arms.HiddenArm, robot: Any, policy: Policy, seconds: float, session: int) -> None:
+    """Write the log of a session in which a policy's goals pass the gate."""
+    gate, goal = SafetyGate(robot.drive.gate(robot.defaults.deploy.gate)), robot.drive.servos.at_rest
+    gate.reset(goal)
 
-    def record(self, path: Path, seconds: float, session: int) -> None:
-        """Write the log of the pipeline's excitation, which begins slowly at the rest position.
+    def act(reading: Any, k: int) -> np.ndarray:
+        nonlocal goal
+        goal = gate.apply(policy(k, goal), 0.0, k / RATE_HZ, reading.velocity)
+        return goal
 
-        Args:
-            session: Seed of jitter and excitation.
-        """
-        pipeline = load_robot("so101")
-        robot = pipeline
-        config = replace(pipeline.defaults.record, duration_s=seconds, seed=1000 * self.number + session)
-        signal = robot.drive.around(excitation(config, hidden.RATE_HZ, len(robot.drive.servos.joints)))
-        away = np.asarray(robot.drive.servos.at_rest) - signal[0]
-        left = np.abs(away) - np.arange(len(signal))[:, None] / hidden.RATE_HZ
-        signal = signal + np.sign(away) * np.maximum(left, 0.0)
-        self._play(path, lambda k, _: signal[k], seconds, session)
+    played = arms.play(arm, robot, act, seconds, session)
+    commands = [{"goal": np.float32(row)} for row in played.goals]
+    write_log(path, "so101", played.times, played.readings, commands, robot.units)
 
-    def probe(self, path: Path, session: int) -> None:
-        """Write the log of the small steps before a deployment: away from rest and back."""
-        robot = load_robot("so101")
-        rest, probe = np.asarray(robot.drive.servos.at_rest, float), robot.drive.probe
-        away = rest + STEP_RAD * (np.arange(len(rest)) == probe.joint)
-        each = round(STEP_S * hidden.RATE_HZ)
-        self._play(path, lambda k, _: away if k // each % 2 else rest, STEP_S * (STEPS + 1), session)
 
-    def deploy(self, path: Path, seconds: float, session: int) -> None:
-        """Write the log of an episode of the policy written by hand; ``session`` is the seed of its targets."""
-        robot, rng = load_robot("so101"), np.random.default_rng([self.number, session])
-        module = sys.modules[type(robot).__module__]
-        targets = rng.uniform(module.LOW, module.HIGH, (int(seconds / TARGET_S) + 1, len(module.LOW)))
-        fastest = robot.drive.servos.speed
+def steps(robot: Any) -> Policy:
+    """Return the small steps before a deployment: away from rest and back."""
+    rest, each = np.asarray(robot.drive.servos.at_rest, float), round(STEP_S * RATE_HZ)
+    away = rest + STEP_RAD * (np.arange(len(rest)) == robot.drive.probe.joint)
+    return lambda k, _: away if k // each % 2 else rest
 
-        def policy(k: int, goal: np.ndarray) -> np.ndarray:
-            way = targets[int(k / hidden.RATE_HZ / TARGET_S)] - goal
-            return goal + np.clip(APPROACH_HZ * way, -fastest, fastest) / hidden.RATE_HZ
 
-        self._play(path, policy, seconds, session)
+def by_hand(robot: Any, seconds: float, seed: Any) -> Policy:
+    """Return the policy written by hand, which moves the goals to random targets."""
+    module, rng = sys.modules[type(robot).__module__], np.random.default_rng(seed)
+    targets = rng.uniform(module.LOW, module.HIGH, (int(seconds / TARGET_S) + 1, len(module.LOW)))
+    fastest = robot.drive.servos.speed
 
-    def _play(self, path: Path, policy: Policy, seconds: float, session: int) -> None:
-        """Run the loop on a simulated clock, from rest, and write its log."""
-        # Make the plant at rest, with the servos' settings, and the gate.
-        pipeline = load_robot("so101")
-        robot, rng = pipeline, np.random.default_rng([self.number, session, 1])
-        plant: Any = load_plant(robot.drive.embedded.plant, self.plant)
-        sheet, rest = robot.drive.servos.sheet, robot.drive.servos.at_rest
-        plant.data.qpos[:] = rest
-        truth = TruthLog(Path(os.devnull), {"state_names": list(plant.state())})
-        clock = PlantClock(plant, _STEP_NS, 0, round(2e9 * self.sensing_s), truth)
-        zero = [plant.measure(i)[0] - angle for i, angle in zip(plant.servo_ids, rest, strict=True)]
-        for servo_id in plant.servo_ids:
-            clock.configure(servo_id, sheet.p_gain, 0, sheet.profile_rad_s)
-        gate = SafetyGate(robot.drive.gate(pipeline.defaults.deploy.gate))
-        gate.reset(rest)
-        goal, count, acts_ns = np.asarray(rest, float), int(seconds * hidden.RATE_HZ), 0
-        starts, ends = ({n: np.zeros(count) for n in ("sensor", "agent", "actuator")} for _ in range(2))
-        readings, commands = [], []
-        for k in range(count):
-            # Times of the three nodes' steps.
-            at = k / hidden.RATE_HZ
-            for node, took in (("sensor", 1.2e-3), ("agent", 1e-4), ("actuator", 6e-4)):
-                starts[node][k], at = at, at + took * rng.uniform(0.8, 1.2)
-                ends[node][k] = at
-            # The measurement, one latency before the sensor's step, in the encoder's counts.
-            requested_ns = round(1e9 * starts["sensor"][k])
-            clock.advance(requested_ns)
-            sampled_ns = requested_ns - round(1e9 * self.sensing_s * rng.uniform(0.85, 1.15))
-            rows = np.array([clock.sample(i, sampled_ns)[:2] for i in plant.servo_ids])
-            angle = np.round(rows[:, 0] / hidden.COUNT_RAD) * hidden.COUNT_RAD - zero
-            speed = np.round(rows[:, 1] / hidden.SPEED_COUNT_RAD_S) * hidden.SPEED_COUNT_RAD_S
-            readings.append({"position": np.float32(angle), "velocity": np.float32(speed)})
-            # The policy's goals act one latency after the actuator's step.
-            goal = gate.apply(policy(k, goal), 0.0, float(ends["agent"][k]), speed)
-            commands.append({"goal": np.float32(goal)})
-            sent_ns = round(1e9 * (ends["actuator"][k] + self.acting_s * rng.uniform(0.85, 1.15)))
-            acts_ns = max(acts_ns, sent_ns)
-            for servo_id, joint_goal, offset in zip(plant.servo_ids, goal, zero, strict=True):
-                wanted = round((joint_goal + offset) / hidden.COUNT_RAD) * hidden.COUNT_RAD
-                clock.schedule(acts_ns, 0, servo_id, OperatingMode.POSITION, wanted)
-        truth.close()
-        hidden.write_log(path, "so101", (starts, ends), readings, commands, robot.units)
+    def policy(k: int, goal: np.ndarray) -> np.ndarray:
+        way = targets[int(k / RATE_HZ / TARGET_S)] - goal
+        return goal + np.clip(APPROACH_HZ * way, -fastest, fastest) / RATE_HZ
+
+    return policy
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -212,35 +146,35 @@ def one_robot(number: int, options: argparse.Namespace) -> dict[str, Any]:
     import sim2real
     from sim2real.artifacts.recording import Recording
 
-    begin, robot, pipeline = time.process_time(), HiddenArm.draw(number), load_robot("so101")
+    begin, arm, pipeline = time.process_time(), draw(number), load_robot("so101")
     with tempfile.TemporaryDirectory() as folder:
         session = Path(folder) / "session.mcap"
-        robot.record(session, options.record_s, 0)
+        arms.record(session, arm, pipeline, options.record_s)
         config = replace(pipeline.defaults.identify, seed=number, folds=options.folds, generations=options.generations)
         identified = sim2real.identify(pipeline, [Recording.load(session)], config)
-        changes = {c: one_change(robot, c, pipeline, identified, Path(folder), options) for c in options.changes}
-    return {"number": number, "cpu_s": time.process_time() - begin, "truth": asdict(robot), "changes": changes}
+        changes = {c: one_change(arm, c, pipeline, identified, Path(folder), options) for c in options.changes}
+    return {"number": number, "cpu_s": time.process_time() - begin, "truth": asdict(arm), "changes": changes}
 
 
 def one_change(
-    robot: HiddenArm, change: str, pipeline: Any, identified: Any, folder: Path, options: argparse.Namespace
+    arm: arms.HiddenArm, change: str, pipeline: Any, identified: Any, folder: Path, options: argparse.Namespace
 ) -> dict[str, Any]:
     """Return the test's results for a robot after one change, from a deployment with the small steps."""
     from sim2real.artifacts.recording import Recording
     from sim2real.stages.deploy.replay import tested
     from sim2real.stages.deploy.verdict import model_advice
 
-    now, first = robot.changed(change), 1 + list(CAUSES).index(change) * (options.episodes + 2)
+    now, first = changed(arm, change), 1 + list(CAUSES).index(change) * (options.episodes + 2)
     logs = [folder / f"{change}_{e}.mcap" for e in range(options.episodes + 1)]
     for e, log in enumerate(logs[:-1]):
-        now.deploy(log, options.seconds, first + e)
-    now.probe(logs[-1], first + options.episodes)
+        play(log, now, pipeline, by_hand(pipeline, options.seconds, [arm.seed, first + e]), options.seconds, first + e)
+    play(logs[-1], now, pipeline, steps(pipeline), STEP_S * (STEPS + 1), first + options.episodes)
     try:
         replay, drifted = tested(pipeline, identified, [Recording.load(log).episode for log in logs])
     except Sim2RealError as error:
         return {"refused": str(error)}
     verdict = model_advice(replay, drifted)
-    print(f"robot {robot.number}, {change}: {drifted.changes[0].name}, alarms {drifted.alarms}", flush=True)
+    print(f"robot {arm.seed}, {change}: {drifted.changes[0].name}, alarms {drifted.alarms}", flush=True)
     return {
         "alarms": list(drifted.alarms),
         "named": drifted.named.name if drifted.named else "",

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +22,6 @@ from sim2real.graph.schedule import draw
 from sim2real.graph.timeline import Timeline
 from sim2real.robots.nodes import SimActuator, SimSensor
 from sim2real.runtime.compiled.graph import CompiledGraph
-from sim2real.runtime.compiled.wiring import wire
 from sim2real.stages.load import load_module
 from sim2real.types import Array, Key, PyTree
 from sim2real.worlds.joint import JointWorld
@@ -36,7 +34,7 @@ CASES = {
     "30_over_100_hz": ((30.0, 100.0, 0.005), (3, 3, 4)),
 }
 """Kinds of timelines: rates of agent and world [Hz], the world's substep [s]; world ticks after each policy step."""
-QUICK = {"copies": [2], "repeats": 1, "cases": ["hiccups"], "build": [10]}
+QUICK = {"copies": [2], "repeats": 1, "cases": ["hiccups"]}
 
 
 class _Normal:
@@ -203,35 +201,10 @@ def hand_program(rows: int, ticks: tuple[int, ...], world: CostWorld, unroll: in
     return run
 
 
-def bare_program(rows: int, ticks: tuple[int, ...], world: CostWorld) -> Callable[[PyTree], PyTree]:
-    """Return the physics alone, under a constant voltage."""
-    p = params()
-
-    def run(key: Key) -> PyTree:
-        def row(carry: PyTree, _: None) -> tuple[PyTree, None]:
-            for _ in range(sum(ticks)):
-                carry = tick(world, p, *carry, jnp.float32(0.5))
-            return carry, None
-
-        th = jax.random.uniform(key, (), minval=-3.14, maxval=3.14)
-        x = MODEL.Measurement(th=th, thdot=jnp.float32(0.0))
-        return jax.lax.scan(row, (x, jnp.float32(0.0)), length=rows)[0][1]
-
-    return run
-
-
 def tick(world: CostWorld, p: PyTree, x: PyTree, cost: PyTree, u: Array) -> tuple[PyTree, PyTree]:
     """Integrate one tick of the world under a voltage, and add the cost."""
     x = world.integrate(p, x, u)
     return x, cost + task_cost(x, u)
-
-
-def bytes_per_copy(graph: CompiledGraph) -> int:
-    """Return the bytes that a copy carries from row to row, without parameters, which copies may share."""
-    gs = jax.eval_shape(lambda: graph.init(jax.random.key(0), {"world": params()})).replace(params={})
-    return int(
-        sum(np.prod(x.shape) * (8 if x.dtype.name.startswith("key") else x.dtype.itemsize) for x in jax.tree.leaves(gs))
-    )
 
 
 def case(device: str, kind: str, copies: int, repeats: int) -> list[Row]:
@@ -244,7 +217,6 @@ def case(device: str, kind: str, copies: int, repeats: int) -> list[Row]:
     loops = total // sum(ticks)
     rows_per_pass = 1 if jax.default_backend() == "cpu" else 2  # as in the graph's loop
     programs = {
-        "bare": bare_program(loops, ticks, world),
         "hand": hand_program(loops, ticks, world),
         # Several policy steps in a row are unrolled as they are; twice of it took XLA 8 times as long on an H200.
         "unrolled": hand_program(loops, ticks, world, rows_per_pass if len(ticks) == 1 else 1),
@@ -256,7 +228,7 @@ def case(device: str, kind: str, copies: int, repeats: int) -> list[Row]:
     policy_steps = float(graph.timeline.vertices["agent"].count.mean())
     report = graph.report()
     print(kind, copies, {n: f"{1e3 * s:.2f} ms" for n, s in seconds.items()}, report, file=sys.stderr)
-    over = {b: per_tick["graph"] / per_tick[b] for b in ("hand", "unrolled", "bare")}
+    over = {b: per_tick["graph"] / per_tick[b] for b in ("hand", "unrolled")}
     rate = copies * policy_steps / seconds["graph"]
     hand_rate = copies * loops * len(ticks) / seconds["hand"]
     label = f"{device}/{copies}" if kind == "plain" else f"{device}/{kind}/{copies}"
@@ -264,27 +236,9 @@ def case(device: str, kind: str, copies: int, repeats: int) -> list[Row]:
     return [
         row(f"{label}/over_hand", round(over["hand"], 3), "1", "hand-written", goal),
         row(f"{label}/over_hand_unrolled", round(over["unrolled"], 3), "1", "hand-written, loop unrolled as ours"),
-        row(f"{label}/over_bare", round(over["bare"], 3), "1", "physics alone"),
         row(f"{label}/agent_steps_per_s", round(rate), "1/s", f"{hand_rate:.3g} by hand"),
         row(f"{label}/compile_s", round(compile_s["graph"], 2), "s", f"{compile_s['hand']:.2f} by hand", "< 5"),
     ]
-
-
-def building(counts: Sequence[int]) -> list[Row]:
-    """Measure how long timelines take to draw and to wire."""
-    rows = []
-    for episodes in counts:
-        graph_nodes = nodes()
-        draw(graph_nodes, DURATION_S, 10, 0)
-        begin = time.perf_counter()
-        drawn = draw(graph_nodes, DURATION_S, episodes, 0)
-        middle = time.perf_counter()
-        wire(graph_nodes, "agent", drawn)
-        end = time.perf_counter()
-        goals = ("< 1", "< 2") if episodes == 1_000 else ("linear", "linear")
-        for what, seconds, goal in (("draw", middle - begin, goals[0]), ("wire", end - middle, goals[1])):
-            rows.append(row(f"graph/build/{episodes}_episodes_{what}_s", round(seconds, 3), "s", goal=goal))
-    return rows
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -293,7 +247,6 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--name", help="name of the device in the rows; default: cpu or gpu")
     parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES), help="kinds of timelines")
-    parser.add_argument("--build", type=int, nargs="+", default=[1_000, 10_000], help="episodes to draw and to wire")
 
 
 def run(options: argparse.Namespace) -> Report:
@@ -301,11 +254,7 @@ def run(options: argparse.Namespace) -> Report:
     device = f"graph/{options.name or jax.default_backend()}"
     copies = options.copies or ([1024] if jax.default_backend() == "cpu" else [20_000, 100_000])
     cases = [(device, kind, count, options.repeats) for count in copies for kind in options.cases]
-    rows = [r for arguments in cases for r in case(*arguments)]
-    graph_nodes = nodes()
-    graph = CompiledGraph(graph_nodes, "agent", timelines(graph_nodes))
-    rows.append(row("graph/bytes_per_copy", bytes_per_copy(graph), "B", goal="< 2000"))
-    return {"rows": [*rows, *building(options.build)]}
+    return {"rows": [r for arguments in cases for r in case(*arguments)]}
 
 
 def table(report: Report) -> str:

@@ -191,14 +191,19 @@ def ours(log: Log, seed: int) -> Estimate:
 
 
 def _put_friction(spec: mujoco.MjSpec, value: float) -> None:
-    rigs.put_friction(spec, value)
+    rigs.of_joint("frictionloss")(spec, value)
     joint = spec.joint(rigs.JOINT)
     joint.solref_friction, joint.solimp_friction[:2] = [2 * spec.option.timestep, 1.0], 0.999
 
 
 def _problem(log: Log, step_s: float) -> tuple[rigs.Rig, Recording]:
     """Return the servo as a rig, and the recording for the toolbox."""
-    puts = {"kp": rigs.put_kp, "damping": rigs.put_damping, "friction": _put_friction, "armature": rigs.put_armature}
+    puts = {
+        "kp": rigs.put_kp,
+        "damping": rigs.of_joint("damping"),
+        "friction": _put_friction,
+        "armature": rigs.of_joint("armature"),
+    }
     rows = {name: (guess, guess / 5, guess * 5, puts[name]) for name, guess in GUESS.items()}
     spec, start = rigs.hinge(step_s, 1e-9, 0.1, 0.01), np.array([[log.position[0], 0.0]])
     recording = Recording(log.t, log.goal[:, None], log.position[:, None], start)

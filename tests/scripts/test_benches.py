@@ -21,7 +21,7 @@ from benches.rows import missed, row, text_of, values  # noqa: E402
 PROCESSES = ("arm", "demo", "so101")
 """Benches that start robots or keep deadlines on the wall clock."""
 ON_A_GPU = ("walk-train",)
-FLAGS = {"compose": ["--parts", "step"], "graph": ["--mjx", "0"], "randomise": ["--ways", "all", "--record-s", "12"]}
+FLAGS = {"randomise": ["--ways", "all", "--record-s", "12"]}
 ON_A_CPU = [
     pytest.param(name, marks=[pytest.mark.process] if name in PROCESSES else [])
     for name in bench.BENCHES
@@ -38,6 +38,8 @@ def run(tmp_path, name, *flags):
 @pytest.mark.night
 @pytest.mark.parametrize("name", ON_A_CPU)
 def test_quick_run_writes_a_report(name, tmp_path):
+    if name == "compose":
+        pytest.importorskip("warp")
     report = run(tmp_path, name, *FLAGS.get(name, ()))
     assert {"command", "commit", "date", "machine", "versions", "seeds"} <= set(report)
     assert report["quick"]

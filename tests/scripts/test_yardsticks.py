@@ -29,7 +29,7 @@ def test_a_recording_that_ends_without_torque_is_simulated_through():
     constants = {"duty_per_rad": duty_per_rad, "mass": 0.49, "length": 0.1, "torque_enable": enabled}
     goal = np.full((400, 1), 0.5)
     recording = Recording(t, goal, np.where(enabled, 0.4, 0.0)[:, None], np.zeros((1, 2)), constants)
-    rows = {"torque": (0.5, 0.1, 2.0, rigs.put_torque), "damping": (0.05, 0.0, 0.5, rigs.put_damping)}
+    rows = {"torque": (0.5, 0.1, 2.0, rigs.put_torque), "damping": (0.05, 0.0, 0.5, rigs.of_joint("damping"))}
     rig = rigs.Rig(rigs.servo_runs, rows, {}, rows)
     angle = rigs.Fit(rig, rigs._parameters(rows, delay=False)[0], 0).predict([recording])[0][:, 0]
     assert angle.shape == t.shape

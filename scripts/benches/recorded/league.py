@@ -5,9 +5,7 @@
 
 Each entrant fits the same parts of the same recordings within the same processor time, compilation included, and
 predicts the held-out part. The settings of its pipeline determine the time of ours, which is reported. The rows are
-mean and worst over the folds of a set, and the worst joint. A fit gets no test part. A
-folder in --data with a league.toml (benches/recorded/sets.py) is a set, too. --jobs runs several fits at once, each in
-its own process on one processor.
+mean and worst over the folds of a set, and the worst joint. A fit gets no test part.
 --results gets a line for each fold and entrant at once: an interrupted run continues from there.
 """
 
@@ -27,7 +25,7 @@ import numpy as np
 from benches import jobs
 from benches import rows as figures
 from benches.recorded import bam, ours, published, textbook
-from benches.recorded.sets import FORCES, Fold, LeagueSet, Recording, available
+from benches.recorded.sets import SETS, Fold, LeagueSet, Recording
 from benches.rows import Report, Row, markdown, values
 from sim2real.errors import UsageError
 
@@ -91,7 +89,7 @@ _KEY = ("set", "fold", "entrant", "budget_s", "seed")
 
 def _tasks(options: argparse.Namespace) -> dict[tuple[Any, ...], tuple[LeagueSet, Fold, str]]:
     """Return the fits to do: key in --results -> set, fold and entrant."""
-    tasks, there = {}, available(options.data)
+    tasks, there = {}, {n: s for n, s in SETS.items() if (options.data / s.folder).is_dir()}
     for name in options.sets or there:
         if name not in there:
             raise UsageError(f"{options.data} has no set {name!r}", hint=f"available: {', '.join(there)}")
@@ -122,11 +120,11 @@ def fit(name: str, fold: Fold, entrant: str, options: argparse.Namespace) -> Fit
     """Fit one entrant; raise NoFormError if it has no form for such a rig."""
     budget_s, seed, constants = options.budget_s, options.seed, fold.fitted[0].constants
     if entrant == "ours":
-        return Fitted(*ours.fit(name, fold, options.data, seed))
+        return Fitted(*ours.fit(name, fold, seed))
     if entrant in published.SETS:
         return Fitted(lambda recordings: published.predict(entrant, recordings), "not fitted")
     if entrant == "textbook":
-        force = name == "disk" or constants.get("command") in FORCES
+        force = name in ("disk", "emps")
         loaded = name in ("disk", "xl330", "sts3250")
         return _joint_by_joint(fold, lambda rs, s: Fitted(*textbook.fit(rs, force, loaded, s, seed)), budget_s)
     if entrant.startswith("bam"):
@@ -149,10 +147,7 @@ def fit(name: str, fold: Fold, entrant: str, options: argparse.Namespace) -> Fit
     if "mjcf" not in constants:
         rig = rigs.one_joint(name)
         return _joint_by_joint(fold, lambda rs, s: mujoco(rig, rs, s), budget_s)
-    rig = (rigs.legs if name == "go2" else rigs.described)(fold.fitted[0])
-    if rig is None:
-        raise NoFormError("the model has other joints than those that were recorded")
-    return mujoco(rig, fold.fitted, budget_s)
+    return mujoco((rigs.legs if name == "go2" else rigs.axis)(fold.fitted[0]), fold.fitted, budget_s)
 
 
 def _joint_by_joint(fold: Fold, single: Callable[[list[Recording], float], Fitted], budget_s: float) -> Fitted:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from benches.recorded.sets import BEFORE, DISK_BLOCK, DISK_BLOCKS, Fold, Recording, load
+from benches.recorded.sets import BEFORE, Fold, Recording, load
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
 from sim2real.identification import predictions as prediction
@@ -55,13 +55,10 @@ Fit = tuple[Predict, str]
 """Predictor and summary."""
 SETS = {"disk": "disk", "xl330": "xl330", "so101": "so101_log"}
 """Sets with a pipeline of ours, and its name."""
-CHOOSES = ("sts3250",)
-"""Sets with `--terms auto`, besides described ones; for a quadruped's twelve joints that takes 15 min."""
-COLUMNS = (
-    {"position": "q_rad", "goal": "q_goal_rad", "torque": "torque_nm", "duty": "duty"},
-    {"position": "q_m", "goal": "q_goal_m", "torque": "force_n", "duty": "duty"},
-)
-"""Names of columns that an import understands, of hinges and of sliding joints."""
+CHOOSES = ("sts3250", "emps")
+"""Sets with `--terms auto`; for a quadruped's twelve joints that takes 15 min."""
+COLUMNS = ("q_rad", "q_goal_rad"), ("q_m", "force_n")
+"""Names of columns of positions and commands that an import understands, of hinges and of a slide that forces push."""
 ARM = """<mujoco>
   <option timestep="0.002"/>
   <worldbody>
@@ -73,14 +70,6 @@ ARM = """<mujoco>
 </mujoco>
 """
 """The model that docs/guides/any_robot.md gives for a servo with a mass on an arm."""
-
-
-def make_case(name: str, budget: Mapping[str, Any]) -> Case:
-    """Return the case of a pipeline, with its settings, but for those of the budget."""
-    pipeline = load_robot(name)
-    robot: Any = pipeline
-    config = replace(pipeline.defaults.identify, **budget)
-    return Case(name, config, robot, robot.identifiable(config.max_delay_s))
 
 
 def identify(case: Case, fitted: Mapping[str, Episode]) -> ModelFit:
@@ -113,29 +102,24 @@ def predict_whole(case: Case, models: Mapping[str, Any], test: Mapping[str, Epis
     return columns | {"ahead": columns["into"] - settle}
 
 
-def fit(name: str, fold: Fold, data: Path, seed: int) -> Fit:
+def fit(name: str, fold: Fold, seed: int) -> Fit:
     """Identify with our own settings, without a limit of time.
 
     Args:
         fold: If the set has a pipeline, its recordings are read again, as logs.
     """
-    return _fit_pipeline(name, fold, data, seed) if name in SETS else _fit_described(name, fold, seed)
+    return _fit_pipeline(name, fold, seed) if name in SETS else _fit_described(name, fold, seed)
 
 
-def _fit_pipeline(name: str, fold: Fold, data: Path, seed: int) -> Fit:
-    pipeline = SETS[name]
-    case = make_case(pipeline, {})
-    case = replace(case, config=replace(case.config, seed=seed))
-    fit_spec, test_spec = fold.spec or ("", "")
-    specs = [fit_spec]
-    if name == "disk":
-        left = int(fit_spec.split()[1])
-        specs = [f"{DISK_BLOCK * i}:{DISK_BLOCK * (i + 1)}" for i in range(DISK_BLOCKS) if i != left]
-    fitted = {k: e for spec in specs for k, e in load(pipeline, data, spec).items()}
-    identified = identify(case, fitted)
+def _fit_pipeline(name: str, fold: Fold, seed: int) -> Fit:
+    pipeline, robot = SETS[name], load_robot(SETS[name])
+    config = replace(robot.defaults.identify, seed=seed)
+    case = Case(pipeline, config, robot, robot.identifiable(config.max_delay_s))
+    assert fold.logs
+    identified, judged = identify(case, load(pipeline, fold.logs[0])), fold.logs[1]
 
     def predict(test_recordings: Sequence[Recording]) -> list[np.ndarray]:
-        test = load(pipeline, data, test_spec, BEFORE)
+        test = load(pipeline, judged)
         columns = predict_whole(case, {"identified": identified.values}, test)
         return [_at(case, columns, r, one) for r, one in enumerate(test_recordings)]
 
@@ -146,13 +130,13 @@ def _fit_pipeline(name: str, fold: Fold, data: Path, seed: int) -> Fit:
 def _fit_described(name: str, fold: Fold, seed: int) -> Fit:
     """Identify a robot from a model and logs, with the terms and the settings of `new`."""
     # The logs have the gains only if the fitted recordings differ in them: a constant gain has no effect of its own.
-    constants, gains = fold.fitted[0].constants, len({r.constants.get("duty_per_rad") for r in fold.fitted}) > 1
+    gains = len({r.constants.get("duty_per_rad") for r in fold.fitted}) > 1
     with tempfile.TemporaryDirectory() as folder:
         logs, model = _written(fold.fitted, Path(folder), gains), _model(fold.fitted, Path(folder))
         with contextlib.redirect_stderr(io.StringIO()):  # drops the messages on columns, which repeat for each fold
-            flags = RobotFlags(mjcf=model, **{**constants.get("flags", {}), "as_told": True})
+            flags = RobotFlags(mjcf=model, as_told=True)
             pipeline = from_model.describe_robot(flags, [str(p) for p in logs]).made()
-        wanted = "auto" if name in CHOOSES else constants.get("terms", "own")
+        wanted = "auto" if name in CHOOSES else "own"
         robot = shared.offering(pipeline, wanted)
         fitted = {str(p): open_recording(p, robot).episode for p in logs}
     config = replace(pipeline.defaults.identify, seed=seed)
@@ -207,9 +191,8 @@ def _written(recordings_to_write: Sequence[Recording], folder: Path, gains: bool
     """
     paths = []
     for i, r in enumerate(recordings_to_write):
-        names = COLUMNS[bool(r.constants.get("sliding"))]
-        columns: dict[str, Any] = {"t_s": r.t, names["position"]: r.position}
-        columns[names[r.constants.get("command", "goal")]] = r.command
+        position, command = COLUMNS["sliding" in r.constants]
+        columns: dict[str, Any] = {"t_s": r.t, position: r.position, command: r.command}
         if "torque_enable" in r.constants:
             columns["torque_enable"] = np.asarray(r.constants["torque_enable"], np.float64)[:, None]
         if gains:

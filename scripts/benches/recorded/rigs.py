@@ -257,34 +257,24 @@ def _add_drive_and_sensor(spec: mujoco.MjSpec, joint: str, name: str) -> Any:
     return drive
 
 
+def of_joint(name: str, j: int = 0) -> Put:
+    """Return the setter of a joint's ``damping``, ``frictionloss`` or ``armature``."""
+    return lambda spec, value: _set_joint(spec.joints[j], name, value)
+
+
 def put_gain(spec: mujoco.MjSpec, value: float) -> None:
     """Set the gain of a motor."""
-    spec.actuator(DRIVE).gainprm[0] = value
+    spec.actuators[0].gainprm[0] = value
 
 
 def put_torque_offset(spec: mujoco.MjSpec, value: float) -> None:
     """Set a constant torque."""
-    spec.actuator(DRIVE).biasprm[0] = value
+    spec.actuators[0].biasprm[0] = value
 
 
 def put_mass(spec: mujoco.MjSpec, value: float) -> None:
     """Set the mass of the load."""
     spec.body("load").mass = value
-
-
-def put_damping(spec: mujoco.MjSpec, value: float) -> None:
-    """Set the viscous damping."""
-    spec.joint(JOINT).damping[0] = value
-
-
-def put_friction(spec: mujoco.MjSpec, value: float) -> None:
-    """Set the dry friction."""
-    spec.joint(JOINT).frictionloss = value
-
-
-def put_armature(spec: mujoco.MjSpec, value: float) -> None:
-    """Set the armature."""
-    spec.joint(JOINT).armature = value
 
 
 def put_torque(spec: mujoco.MjSpec, value: float) -> None:
@@ -340,20 +330,24 @@ def one_joint(kind: str) -> Rig:
 
     The arm's joints do not feel each other, nor gravity beyond the offset; an armature of 0.01 is given.
     """
-    armature = {"armature": (*_ARMATURE[kind], put_armature)}
+    armature = {"armature": (*_ARMATURE[kind], of_joint("armature"))}
+
+    def losses(damping: tuple[float, float, float], friction: tuple[float, float, float]) -> dict[str, Row]:
+        return {"damping": (*damping, of_joint("damping")), "frictionloss": (*friction, of_joint("frictionloss"))}
+
     if kind == "disk":  # armature and the distance of its mass are given, else only ratios would be identifiable
         spec = hinge(PHYSICS_S["disk"], 0.1, 0.041, 1e-4)
-        joint = {"damping": (0.0005, 0.0, 0.01, put_damping), "frictionloss": (0.0005, 0.0, 0.02, put_friction)}
+        joint = losses((0.0005, 0.0, 0.01), (0.0005, 0.0, 0.02))
         gain = {"gain": (0.005, 0.0005, 0.1, put_gain)}
         drive = {"mass": (0.1, 0.01, 1.0, put_mass), **gain}
         more = {"torque": (0.0, -0.01, 0.01, put_torque_offset)}
         return Rig(lambda r: [Run(r, spec)], {**drive, **joint}, more, {**gain, **joint, **armature}, biased=False)
     if kind in _TORQUE:
-        joint = {"damping": (0.01, 0.0, 0.5, put_damping), "frictionloss": (0.03, 0.0, 0.3, put_friction)}
+        joint = losses((0.01, 0.0, 0.5), (0.03, 0.0, 0.3))
         plain = {"torque": (*_TORQUE[kind], put_torque), **joint, **armature}
         return Rig(servo_runs, plain, {"back_emf": (0.03, 0.0, 1.0, put_back_emf)}, plain)
     spec = hinge(PHYSICS_S["so101"], 1e-9, 0.1, 0.01)
-    joint = {"damping": (0.5, 0.0, 10.0, put_damping), "frictionloss": (0.02, 0.0, 2.0, put_friction)}
+    joint = losses((0.5, 0.0, 10.0), (0.02, 0.0, 2.0))
     plain = {"kp": (10.0, 0.5, 200.0, put_kp), **joint}
     return Rig(lambda r: [Run(r, spec)], plain, {"offset": (0.0, -0.3, 0.3, put_offset)}, {**plain, **armature})
 
@@ -387,10 +381,6 @@ def _set_drive(drive: Any, kp: float | None, kd: float | None) -> None:
         drive.biasprm[2] = -kd
 
 
-def _of_joint(name: str, j: int) -> Put:
-    return lambda spec, value: _set_joint(spec.joints[j], name, value)
-
-
 def _of_joints(name: str) -> Put:
     return lambda spec, value: [_set_joint(joint, name, value) for joint in spec.joints] and None
 
@@ -401,7 +391,7 @@ def _of_drives(put: Callable[[Any, float], None]) -> Put:
 
 def _per_joint(count: int, rows: dict[str, tuple[float, float, float]]) -> Iterator[tuple[str, Row]]:
     for name, limits in rows.items():
-        yield from ((f"{name}{j}", (*limits, _of_joint(name, j))) for j in range(count))
+        yield from ((f"{name}{j}", (*limits, of_joint(name, j))) for j in range(count))
 
 
 def legs(recording: Recording) -> Rig:
@@ -419,34 +409,11 @@ def legs(recording: Recording) -> Rig:
     return Rig(lambda r: [Run(r, spec)], plain, more, {**each, **friction})
 
 
-def described(recording: Recording) -> Rig | None:
-    """Return a robot from its MJCF, whose values are the guesses; None if its joints are not those recorded."""
-    spec, force = robot_spec(recording.constants["mjcf"]), recording.constants.get("command", "goal") != "goal"
-    model, count = spec.compile(), recording.position.shape[1]
-    if not model.njnt == model.nv == count:
-        return None
-    rows: dict[str, Row] = {}
-    for name, least in {"damping": 0.1, "frictionloss": 0.05, "armature": 0.01}.items():
-        for j, value in enumerate(getattr(model, f"dof_{name}")):
-            guess = float(np.squeeze(value)) or least
-            rows[f"{name}{j}"] = (guess, 1e-6, 10 * guess, _of_joint(name, j))
-    more: dict[str, Row] = {}
-    if force:
-
-        def factor(actuator: Any, value: float) -> None:
-            actuator.gainprm[0] = value
-
-        def constant(actuator: Any, value: float) -> None:
-            actuator.biasprm[0] = value
-
-        for actuator in spec.actuators:
-            actuator.biasprm[:3] = 0.0
-        most = 0.2 * float(np.abs(recording.command).max())
-        drive, more = (
-            {"gain": (1.0, 0.1, 10.0, _of_drives(factor))},
-            {"constant": (0.0, -most, most, _of_drives(constant))},
-        )
-    else:
-        drive = {"kp": (GO2_KP, 1.0, 500.0, _of_drives(lambda a, v: _set_drive(a, v, None)))}
-        drive["kd"] = (GO2_KD, 0.0, 20.0, _of_drives(lambda a, v: _set_drive(a, None, v)))
-    return Rig(lambda r: [Run(r, spec)], {**drive, **rows}, more, {**drive, **rows}, biased=not force)
+def axis(recording: Recording) -> Rig:
+    """Return the EMPS's slide, which a force pushes; the values of its MJCF are the guesses."""
+    spec = robot_spec(recording.constants["mjcf"])
+    spec.actuators[0].biasprm[:3] = 0.0
+    limits = {n: (v, 1e-6, 10 * v) for n, v in (("damping", 100.0), ("frictionloss", 10.0), ("armature", 0.1))}
+    rows = {"gain": (1.0, 0.1, 10.0, put_gain), **dict(_per_joint(1, limits))}
+    most = 0.2 * float(np.abs(recording.command).max())
+    return Rig(lambda r: [Run(r, spec)], rows, {"constant": (0.0, -most, most, put_torque_offset)}, rows, biased=False)
