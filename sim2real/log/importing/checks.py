@@ -183,8 +183,7 @@ def check(
     if found is None:
         text = "the stamps of goals and positions overlap in fewer than 50 samples: nothing is checked"
         return [Finding("overlap", -1, text, "refuse")]
-    copies = copied(*t_s, goal, position)
-    measures = [_measure(found, i, names, by_name, bool(copies[i]), goal, position) for i in range(len(names))]
+    measures = [_measure(found, i, names, by_name, t_s, goal, position) for i in range(len(names))]
     findings: list[Finding] = []
     following: list[int] = []
     for i, m in enumerate(measures):
@@ -302,10 +301,12 @@ def respond(
     return Response(lags * period_s, r, cov / vx[:, None, :], (mean[0], mean[1]), (spread[0], spread[1]), sample_s)
 
 
-def _measure(found: Response, i: int, names: Sequence[str], by_name: bool, copied: bool, goal: np.ndarray,
-             position: np.ndarray) -> JointMeasures:  # fmt: skip
+def _measure(found: Response, i: int, names: Sequence[str], by_name: bool, t_s: tuple[np.ndarray, np.ndarray],
+             goal: np.ndarray, position: np.ndarray) -> JointMeasures:  # fmt: skip
     """Return the measures of a joint."""
     level, moves = float(np.median(position[:, i])), bool(min(s[i] for s in found.spread) > _STILL)
+    lead_r, lead_s, _ = found.best(i, i, 1.0, _LAGS_S[0])
+    copied = lead_r > 0.95 and is_copy(t_s, goal[:, i], position[:, i], lead_s)
     if copied or not moves:
         held = float(np.median(goal[:, i])) if np.ptp(goal[:, i]) < 4 * _STILL else np.nan
         return JointMeasures(names[i], copied, moves, held, level)
@@ -313,7 +314,6 @@ def _measure(found: Response, i: int, names: Sequence[str], by_name: bool, copie
     r, lag_s, slope = found.best(i, i, 1.0, begin_s)
     against, _, mirrored = found.best(i, i, -1.0, begin_s)
     slope = slope if r > -against else -mirrored
-    lead_r, lead_s, _ = found.best(i, i, 1.0, _LAGS_S[0])
     misfit, mirror = found.misfit(i, i, 1.0, r), found.misfit(i, i, -1.0, against)
     # Compare with the goals of other joints, apart from those that equal its own, or its opposite.
     own, others, rivals = max(r, -against), [], []
@@ -544,37 +544,22 @@ def unsigned(values: np.ndarray) -> int | None:
     return None
 
 
-def copied(t_goal: np.ndarray, t_position: np.ndarray, goal: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Return whether goals are copies of positions up to 1 s before or after them, ``(joints,)``.
-
-    Args:
-        t_goal: Shape ``(N,)`` [s].
-        t_position: Shape ``(M,)`` [s].
-        goal: Shape ``(N, joints)``.
-        position: Shape ``(M, joints)``, in the unit of the goals.
-    """
-    copies = np.zeros(position.shape[1], bool)
-    if min(len(t_goal), len(t_position)) < 20:
-        return copies
-    newest = np.searchsorted(t_goal, t_position + 1e-6, side="right") - 1
-    most = round(1.0 / max(float(np.median(np.diff(t_goal))), 1e-4))
-    shifts = np.arange(-most, most + 1)
-    for i in range(position.shape[1]):
-        q, c = position[:, i], goal[:, i]
-        # Compare only rows in motion: resting columns are equal at every lag.
-        moved = np.abs(np.diff(q, prepend=q[:1]))
-        rows = np.flatnonzero(moved > 0.01 * moved.max(initial=0.0))
-        if q.std() < 1e-9 or len(rows) < 20:
-            continue
-        rows = rows[:: max(len(rows) // 400, 1)]
-        exact = 1e-5 * q.std() + 1.1e-6 * np.abs(q).max()
-        rounded = max(exact, 0.51 * max(_step(c), _step(q)))
-        at = newest[rows][:, None] + shifts
-        inside = (at >= 0) & (at < len(c))
-        off = np.abs(q[rows][:, None] - c[np.clip(at, 0, len(c) - 1)])
-        equal = (off <= np.where(np.abs(shifts) <= 1, rounded, exact)) & inside
-        copies[i] = ((equal.sum(axis=0) >= 0.98 * inside.sum(axis=0)) & (inside.sum(axis=0) >= 20)).any()
-    return copies
+def is_copy(t_s: tuple[np.ndarray, np.ndarray], goal: np.ndarray, position: np.ndarray, lag_s: float) -> bool:
+    """Return whether goals ``(N,)`` are copies of positions ``(M,)`` that are one lag older, or younger."""
+    period_s = max(float(np.median(np.diff(t_s[0]))), 1e-6)
+    newest = np.searchsorted(t_s[0], t_s[1] + 1e-6, side="right") - 1
+    # Compare only rows in motion: resting columns are equal at every lag.
+    moved = np.abs(np.diff(position, prepend=position[:1]))
+    rows = np.flatnonzero(moved > 0.01 * moved.max(initial=0.0))
+    exact = 1e-5 * position.std() + 1.1e-6 * np.abs(position).max()
+    for shift in round(lag_s / period_s) + np.arange(-1, 2):
+        at = newest[rows] - shift
+        inside = (at >= 0) & (at < len(goal))
+        off = np.abs(position[rows] - goal[np.clip(at, 0, len(goal) - 1)])[inside]
+        rounded = 0.51 * max(_step(goal), _step(position)) if abs(shift) <= 1 else 0.0
+        if off.size >= 20 and np.mean(off <= max(exact, rounded)) >= 0.98:
+            return True
+    return False
 
 
 def _step(values: np.ndarray) -> float:
