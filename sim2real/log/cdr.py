@@ -85,14 +85,6 @@ def length(count: int) -> CdrConstant:
     return CdrConstant(struct.pack("<I", count), 4)
 
 
-def read_text(data: bytes, position: int) -> tuple[str, int]:
-    """Return the string at the next aligned position of a message, and the position after the string."""
-    position += -(position - len(ENCAPSULATION)) % 4
-    (count,) = struct.unpack_from("<I", data, position)
-    end = position + 4 + count
-    return data[position + 4 : end - 1].decode(), end
-
-
 class Layout:
     """The byte layout of a message type.
 

@@ -23,7 +23,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.episode import Episode, Messages, Steps
-from sim2real.log.cdr import Layout, read_text
+from sim2real.log.cdr import Layout
 from sim2real.log.schema import MESSAGE_LAYOUT, STEP_LAYOUT, layout_of_fields, units_of_fields
 from sim2real.log.session import SESSION, SESSION_END, decode
 from sim2real.log.writer import LIBRARY
@@ -40,10 +40,7 @@ _MESSAGE_AT, _DATA_AT = 9, 31
 _LANDMARK = re.compile(rb"(?P<chunk>\x03\x00\x00\x00lz4|\x04\x00\x00\x00zstd)|\x0b\x00\x00\x00session_end")
 _CHUNK_NAME_AT, _METADATA_NAME_AT = 37, 9
 # Role of a channel -> required keys of its metadata; joint states repeat the outputs and are not decoded.
-_ROLES = {"step": {"node"}, "output": {"node", "fields"}, "input": {"node", "input"}, "events": set[str]()}
-_ROLES["joint_states"] = set()
-# Positions of an event's level, and of its name before alignment [bytes].
-_LEVEL_AT, _NAME_AT = 12, 13
+_ROLES = {"step": {"node"}, "output": {"node", "fields"}, "input": {"node", "input"}, "joint_states": set[str]()}
 _ALL = 0, 2**63
 """All times of a log [ns]."""
 
@@ -75,7 +72,7 @@ class _Contents:
     skipped: list[str] = field(default_factory=list)  # descriptions of the unreadable places
 
     def with_role(self, role: str) -> dict[int, Channel]:
-        """Return the channels with a role: ``step``, ``output``, ``input`` or ``events``."""
+        """Return the channels with a role: ``step``, ``output`` or ``input``."""
         return {number: c for number, c in self.channels.items() if c.metadata["role"] == role}
 
     def columns(self, channel: int, layout: Layout, span: tuple[int, int]) -> np.ndarray:
@@ -170,9 +167,9 @@ def read_log(path: str | Path, start_s: float | None = None, end_s: float | None
 
     The readable part of a damaged log is read, with a warning. The episode's metadata has the session's entries and
     ``log``, a dictionary with ``epoch_ns`` (wall clock at time 0), ``session_end`` (None after a crash),
-    ``attachments`` (names), ``events`` (each with time_s, level, kind, text), ``first_seq`` (node -> number of its
-    first step in the episode, 0 in a whole log), ``missing_steps`` (node -> number of lost steps before the last one)
-    and ``skipped`` (descriptions of the unreadable places).
+    ``attachments`` (names), ``first_seq`` (node -> number of its first step in the episode, 0 in a whole log),
+    ``missing_steps`` (node -> number of lost steps before the last one) and ``skipped`` (descriptions of the unreadable
+    places).
 
     Args:
         start_s: Read steps that end, and messages that arrive, at this time or later [s from the episode's start];
@@ -196,7 +193,7 @@ def read_log(path: str | Path, start_s: float | None = None, end_s: float | None
     begin, end = (ns if s is None else max(0, contents.epoch_ns + round(s * 1e6) * 1000) for s, ns in limits)
     with _readable_errors(path):
         steps, outputs, sequences = _steps_and_outputs(contents, (begin, end))
-        messages, events = _connections(contents, (begin, end), sequences), _events(contents, (begin, end))
+        messages = _connections(contents, (begin, end), sequences)
         units = _output_units(contents)
     # Steps before the first one count as lost, unless the range starts later.
     firsts = {node: int(s[0]) for node, s in sequences.items() if len(s)}
@@ -209,7 +206,6 @@ def read_log(path: str | Path, start_s: float | None = None, end_s: float | None
         "epoch_ns": contents.epoch_ns,
         "session_end": contents.end,
         "attachments": list(contents.attachments),
-        "events": events,
         "first_seq": firsts,
         "missing_steps": missing,
         "skipped": contents.skipped,
@@ -381,19 +377,6 @@ def _connections(
             received=received,
         )
     return connections
-
-
-def _events(contents: _Contents, span: tuple[int, int]) -> list[dict[str, Json]]:
-    events = []
-    for number in contents.with_role("events"):
-        for record in contents.messages[number]:
-            log_time, payload = int.from_bytes(record[15:23], "little"), record[_DATA_AT:]
-            if span[0] <= log_time < span[1]:
-                kind, position = read_text(payload, _NAME_AT)
-                text, _ = read_text(payload, position)
-                time_s = (log_time - contents.epoch_ns) / 1e9
-                events.append({"time_s": time_s, "level": payload[_LEVEL_AT], "kind": kind, "text": text})
-    return events
 
 
 def _warn(path: str | Path, contents: _Contents, missing: Mapping[str, int]) -> None:

@@ -16,17 +16,10 @@ STEP_FIELDS = ("seq", "scheduled", "start", "woken", "ts_overwrite", "end", "dri
 MESSAGE_FIELDS = ("seq_out", "seq_in")
 _INT64 = np.dtype("<i8")
 _RULE = "=" * 80
-_TIME = "int32 sec\nuint32 nanosec\n"
-EVENTS_TOPIC = "/rosout"
-EVENTS_SCHEMA = "rcl_interfaces/msg/Log"
-EVENTS_TEXT = (
-    "builtin_interfaces/Time stamp\nuint8 level\nstring name\nstring msg\nstring file\nstring function\nuint32 line\n"
-    f"{_RULE}\nMSG: builtin_interfaces/Time\n{_TIME}"
-)
 _JOINT_STATE_TEXT = (
     "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n"
     f"{_RULE}\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
-    f"{_RULE}\nMSG: builtin_interfaces/Time\n{_TIME}"
+    f"{_RULE}\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
 )
 
 

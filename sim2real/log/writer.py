@@ -26,11 +26,7 @@ from mcap.writer import CompressionType, Writer
 
 from sim2real.errors import ERROR, OK, Sim2RealError
 from sim2real.graph.episode import MessageRecord, StepRecord, named_leaves
-from sim2real.log.cdr import CdrField, Layout, text
 from sim2real.log.schema import (
-    EVENTS_SCHEMA,
-    EVENTS_TEXT,
-    EVENTS_TOPIC,
     JointSource,
     Topic,
     input_topic,
@@ -54,10 +50,6 @@ SYNC_PERIOD_S = 1.0
 WAIT_S, REPORT_WAITS, STUCK_S = 0.2, 25, 60.0
 # Limit of the queue's memory [bytes], and memory of a queued record without its arrays.
 MAX_QUEUE_BYTES, RECORD_BYTES = 1 << 30, 500
-# The warning level of rcl_interfaces/msg/Log.
-WARN = 30
-
-
 LIBRARY = "sim2real"
 # Small, so that reading a range decompresses little, and a damaged byte costs little data.
 CHUNK_BYTES = 64 * 1024
@@ -113,8 +105,6 @@ class SessionFile:
         self._topics = self._all_topics()
         self._channels: dict[str, int] = {}
         self._epoch_ns = 0
-        self._start_monotonic_ns = 0
-        self._early_events: list[tuple[int, int | None, int, str, str]] = []
         # Encode the metadata before the file exists, so that an error leaves no file.
         session = encode(SESSION, metadata)
         try:
@@ -149,7 +139,7 @@ class SessionFile:
             epoch_ns: Time 0 on the wall clock [ns].
             monotonic_ns: Time 0 on the monotonic clock [ns].
         """
-        self._epoch_ns, self._start_monotonic_ns = epoch_ns, monotonic_ns
+        self._epoch_ns = epoch_ns
         loose = RecordBuilder()
         schemas: dict[str, int] = {}
         for topic in self._topics:
@@ -164,8 +154,6 @@ class SessionFile:
             self._channels[topic.name] = channel
         # Write the definitions also before the first chunk, so that the loss of that chunk does not lose the others.
         self._stream.write(loose.end())
-        for event in self._early_events:
-            self.event(*event)
 
     def step(self, record: StepRecord, leaves: Sequence[npt.ArrayLike]) -> None:
         """Write a step, its output and its joint states."""
@@ -201,31 +189,6 @@ class SessionFile:
         sent, received = (self._epoch_ns + 1000 * ticks for ticks in (record.sent, record.received))
         self._add(topic, payload, record.seq_out, received, sent)
 
-    def event(self, monotonic_ns: int, ticks: int | None, level: int, kind: str, message: str) -> None:
-        """Write an event.
-
-        Args:
-            monotonic_ns: Time of the event on the monotonic clock [ns].
-            ticks: Time on a simulated clock [us from the episode's start]; None: use ``monotonic_ns``.
-            level: Level as in ROS: 20 information, 30 warning, 40 error, 50 fatal.
-        """
-        topic = self._topics[-1]
-        if not self._channels:
-            self._early_events.append((monotonic_ns, ticks, level, kind, message))
-            return
-        # Times before the episode's start are negative, which the wall clock allows.
-        passed_ns = monotonic_ns - self._start_monotonic_ns if ticks is None else 1000 * ticks
-        time_ns = self._epoch_ns + passed_ns
-        stamp = [
-            CdrField("sec", np.dtype("<i4")),
-            CdrField("nanosec", np.dtype("<u4")),
-            CdrField("level", np.dtype("u1")),
-        ]
-        texts = [text(kind), text(message), text(""), text("")]
-        layout = Layout([*stamp, *texts, CdrField("line", np.dtype("<u4"))])
-        payload = layout.pack((time_ns // 1_000_000_000, time_ns % 1_000_000_000, level, 0))
-        self._add(topic, payload, self.counts.get(topic.name, 0), time_ns, time_ns)
-
     def flush(self) -> None:
         """Pass the written records to the operating system, so that they survive the end of this process."""
         self._writer.flush()
@@ -249,12 +212,10 @@ class SessionFile:
             self._stream.close()
 
     def _all_topics(self) -> list[Topic]:
-        """Return the topics of all channels; the topic of events is the last one."""
+        """Return the topics of all channels."""
         topics = [t for node in self._nodes.values() for t in (node.step, node.output) if t.layout.fields]
         topics += self._inputs.values()
-        topics += [node.joints.topic for node in self._nodes.values() if node.joints is not None][:1]
-        events = Topic(EVENTS_TOPIC, EVENTS_SCHEMA, EVENTS_TEXT, Layout(()), {"role": "events"})
-        return [*topics, events]
+        return topics + [node.joints.topic for node in self._nodes.values() if node.joints is not None][:1]
 
     def _add(self, topic: Topic, payload: bytes, sequence: int, log_time: int, publish_time: int) -> None:
         channel = self._channels.get(topic.name)
@@ -322,7 +283,7 @@ def _joint_state(source: JointSource, leaves: Sequence[npt.ArrayLike], time_ns: 
 class McapRecorder:
     """Writes one episode of a graph into one MCAP file; a ``Recorder``.
 
-    ``start``, ``step``, ``message`` and ``write_event`` only queue: they never wait for the disk, and may be called
+    ``start``, ``step`` and ``message`` only queue: they never wait for the disk, and may be called
     from any thread. The next call raises an error of the writer. As a context manager, it writes an exception that
     leaves the block as the status of the session. If the process ends without ``close``, the status is ``aborted``.
 
@@ -400,15 +361,6 @@ class McapRecorder:
     def message(self, record: MessageRecord) -> None:
         """Queue the record of a message."""
         self._put(self._file.message, record)
-
-    def write_event(self, kind: str, text: str, level: int = WARN, ticks: int | None = None) -> None:
-        """Queue an event, such as a safety stop, which viewers show as a log line; also allowed before ``start``.
-
-        Args:
-            level: Level as in ROS: 20 information, 30 warning, 40 error, 50 fatal.
-            ticks: Time of the event on a simulated clock [us from the episode's start]; None: now.
-        """
-        self._put(self._file.event, time.monotonic_ns(), ticks, level, kind, text)
 
     def close(
         self,

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import time
 import warnings
 
 import fake_sessions
@@ -33,11 +32,9 @@ def test_a_log_reads_back_as_what_was_recorded(tmp_path):
     path = tmp_path / "session.mcap"
     memory = MemoryRecorder()
     log = McapRecorder(path, *fake_sessions.arguments())
-    log.write_event("staged start", "torque on")
     for recorder in (memory, log):
         recorder.start(fake_sessions.EPOCH_NS, 123)
     fake_sessions.feed(range(400), memory, log)
-    log.write_event("watchdog", "no command for 50 ms", level=40, ticks=1_500_000)
     log.close("finished", 0, {"overruns": {"agent": np.int64(3)}})
     log.close()
 
@@ -57,8 +54,6 @@ def test_a_log_reads_back_as_what_was_recorded(tmp_path):
     assert facts["session_end"]["messages"]["/world/output"] == 400
     assert facts["epoch_ns"] == fake_sessions.EPOCH_NS
     assert facts["first_seq"] == dict.fromkeys(fake_sessions.outputs(), 0)
-    assert [e["kind"] for e in facts["events"]] == ["staged start", "watchdog"]
-    assert facts["events"][1] == {"time_s": 1.5, "level": 40, "kind": "watchdog", "text": "no command for 50 ms"}
 
 
 def test_jax_arrays_and_reused_buffers_are_recorded_as_they_were(tmp_path):
@@ -125,7 +120,7 @@ def test_misuse_is_an_error(tmp_path):
         with pytest.raises(Sim2RealError, match="node 'a' has the fields y, expected x"):
             log.step(StepRecord("a", 0, 0, 0, 0, -1, 1, 0), {"y": 1.0})
     with pytest.raises(Sim2RealError, match="is closed"):
-        log.write_event("late", "too late")
+        log.step(StepRecord("a", 1, 0, 0, 0, -1, 1, 0), {"x": 1.0})
     with pytest.raises(Sim2RealError, match="exists already"):
         McapRecorder(path, {}, {}, {}, [])
     with pytest.raises(Sim2RealError, match=r"cannot be written as JSON.*object"):
@@ -159,23 +154,3 @@ def test_data_before_the_start_is_an_error(tmp_path):
     log.step(StepRecord("a", 0, 0, 0, 0, -1, 1, 0), {"x": 1.0})
     with pytest.raises(Sim2RealError, match="call start"):
         log.close()
-
-
-@pytest.mark.parametrize("leap_s", [-3600, 3600])
-def test_a_wall_clock_that_is_set_in_the_middle_changes_nothing(tmp_path, monkeypatch, leap_s):
-    """It is read once, at the start: all times are of the monotonic clock."""
-    episodes = []
-    for leap in (0, leap_s):
-        log = McapRecorder(tmp_path / f"{leap}.mcap", *fake_sessions.arguments())
-        log.start(fake_sessions.EPOCH_NS, time.monotonic_ns())
-        fake_sessions.feed(range(100), log)
-        monkeypatch.setattr(time, "time_ns", lambda leap=leap: fake_sessions.EPOCH_NS + leap * 10**9)
-        monkeypatch.setattr(time, "time", lambda leap=leap: fake_sessions.EPOCH_NS / 1e9 + leap)
-        log.write_event("watchdog", "in the middle")
-        fake_sessions.feed(range(100, 200), log)
-        log.close()
-        episodes.append(read_log(log.path))
-        monkeypatch.undo()
-    assert_same(*episodes)
-    times = [event["time_s"] for event in episodes[1].metadata["log"]["events"]]
-    assert abs(times[0]) < 60

@@ -58,7 +58,7 @@ def test_mcap_ros2_reads_steps_and_stamps(session_log):
 
 def test_rerun_finds_scalars_in_the_joint_states(session_log):
     rerun_chunk = pytest.importorskip("rerun.chunk", reason="rerun-sdk is not installed (extra: view)")
-    reader = rerun_chunk.McapReader(session_log, include_topic_regex=["/joint_states", "/rosout"])
+    reader = rerun_chunk.McapReader(session_log, include_topic_regex=["/joint_states"])
     found = {str(chunk.entity_path): chunk.to_record_batch().schema.names for chunk in reader.stream().to_chunks()}
     assert "Scalars:scalars" in found["/joint_states/position"]
     assert "Scalars:scalars" in found["/joint_states/velocity"]
@@ -85,7 +85,7 @@ def test_a_reader_that_has_only_the_file_gets_every_fields_unit_and_shape(tmp_pa
     with open(path, "rb") as stream:
         summary = make_reader(stream).get_summary()
     channels = {c.topic: c for c in summary.channels.values()}
-    said = {topic: json.loads(c.metadata["fields"]) for topic, c in channels.items() if topic != "/rosout"}
+    said = {topic: json.loads(c.metadata["fields"]) for topic, c in channels.items()}
     found = {topic: {f["name"]: (f.get("unit"), f["shape"]) for f in fields} for topic, fields in said.items()}
     assert found["/arm/output"] == {
         "q": ("rad", [3]), "aim": (["m", "rad"], [2]), "pose": ("mm", [2, 3]), "count": (None, [])

@@ -193,15 +193,9 @@ class Bench:
             "port": self.config.port,
             "hardware": self.rig.device.facts(),
         }
-        # The writer, which starts with a mark if the run is dry.
         inputs = [(n, i) for n, node in graph.nodes.items() for i in node.inputs]
         joints, units = {SENSOR: self.robot.sensor.joints}, dict.fromkeys(graph.nodes, self.robot.units)
-        recorder = McapRecorder(log, metadata, {}, state.aux["outputs"], inputs, joints, units)
-        if self.rig.torque_withheld:
-            recorder.write_event(
-                "dry run", "torque was withheld: no command in this log was sent, and no motor moved a joint"
-            )
-        return recorder
+        return McapRecorder(log, metadata, {}, state.aux["outputs"], inputs, joints, units)
 
     def _summary(self, graph: AsyncGraph, watch: Watch) -> dict[str, Any]:
         # Times of the nodes, in the order of the loop.
@@ -275,8 +269,6 @@ def _end(error: BaseException, graph: AsyncGraph, recorder: McapRecorder, summar
     status = f"{type(error).__name__}: {error}"
     with noted(error):
         graph.stop()
-    with noted(error):
-        recorder.write_event("stop", status)
     with noted(error):
         recorder.close(status, _exit_code(error), summary(), note)
 
