@@ -66,15 +66,6 @@ def figures_as_data(request):
         yield
 
 
-@pytest.fixture
-def virtual_robots():
-    """The embedded robots of stages are in this process and in virtual time; the fixture is a list of those opened."""
-    from virtual_stages import virtual_stages  # as above
-
-    with virtual_stages() as robots:
-        yield robots
-
-
 @pytest.fixture(scope="session")
 def shared_base(tmp_path_factory):
     """A temporary folder that all workers of this session share."""

@@ -14,7 +14,7 @@ TINY = [
     *("--train.episode-s=2", "--train.timelines=4", "--train.force", "--train.no-sensitivity"),
     *("--train.ppo.total-steps=512", "--train.ppo.num-envs=16", "--train.ppo.minibatches=2"),
     *("--train.ppo.evaluations=1", "--deploy.episodes=1", "--deploy.duration-s=2"),
-    *("--deploy.gate.servo-watchdog-s=0.4", "--deploy.no-measure-delay"),
+    "--deploy.no-measure-delay",
 ]
 """Small budgets."""
 

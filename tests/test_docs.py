@@ -112,7 +112,7 @@ def optional(block: str) -> set[str]:
         if python_of(page)
     ],
 )
-def test_the_python_of_a_page_runs(page, tmp_path, monkeypatch, request, virtual_robots):
+def test_the_python_of_a_page_runs(page, tmp_path, monkeypatch, request):
     blocks = [(i, block) for i, block in enumerate(python_of(page), start=1) if not optional(block)]
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(jax, "device_put_replicated", None, raising=False)  # interop.md defines it, for all of JAX

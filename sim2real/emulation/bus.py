@@ -11,12 +11,17 @@ import random
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar, Final, Protocol, TypeVar
 
-from sim2real.emulation.plant import Plant, PlantClock
-from sim2real.emulation.robot import Emulation, PlannedRobot
+from sim2real.emulation.plant import Plant, PlantClock, load_plant
+from sim2real.emulation.robot import NUMBERS, Emulation, PlannedRobot, VirtualChannel, VirtualTime
 from sim2real.emulation.truth import Kind, TruthLog
+from sim2real.errors import HardwareLost
+from sim2real.hardware.bus.port import CUT, EMULATED, Port, Queries, take_torque_off
+from sim2real.hardware.clock import Clock
 from sim2real.hardware.device import OperatingMode
+from sim2real.hardware.safety.guardian import Guardian, Motors
 
 
 @dataclass(frozen=True)
@@ -33,7 +38,6 @@ class BusEmulation(Emulation):
         unplugged_after_s: Time at which the port goes away, as with a pulled USB plug [s]; None: never.
     """
 
-    serve: ClassVar[str] = "sim2real.emulation.process:serve_bus"
     bus_type: ClassVar[Callable[..., PlannedBus[Any]]]
     """Makes the bus from plant, settings, truth, ``send``, ``start_ns`` and ``now_ns``."""
 
@@ -44,6 +48,9 @@ class BusEmulation(Emulation):
     wild: float = 0.0
     frozen_after_s: float | None = None
     unplugged_after_s: float | None = None
+
+    def robot(self, plant: str, plant_args: Mapping[str, Any], truth_path: Path | None) -> VirtualRobot:
+        return VirtualRobot(plant, self, plant_args, truth_path)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -174,11 +181,6 @@ class PlannedBus(PlannedRobot[B]):
         for packet, end in self._parser.feed(chunk):
             t_ns = begin_ns + round(end * self._byte_ns)
             self._at(t_ns, self.execute, Request(packet, t_ns, now_ns))
-        # These bytes may have waited because this process was late, which must not trip a servo's watchdog.
-        for servo in self._firmware.values():
-            deadline_ns = servo.watchdog_deadline_ns()
-            if deadline_ns is not None and deadline_ns < self._wire_free_ns:
-                servo.heard_ns += self._wire_free_ns - deadline_ns + 1
 
     def next_due_ns(self) -> int | None:
         due = [deadline for s in self._firmware.values() if (deadline := s.watchdog_deadline_ns()) is not None]
@@ -286,3 +288,107 @@ class PlannedBus(PlannedRobot[B]):
         """Stop the motor by its own firmware: at once, dropping commands that have not taken effect yet."""
         self._clock.cancel(servo.servo_id)
         self._clock.schedule(t_ns, 0, servo.servo_id, mode, 0.0)
+
+
+class VirtualRobot(VirtualTime):
+    """Emulated servos at `port`, from construction until `stop`; see `Emulation.robot` for the arguments.
+
+    Attributes:
+        port: The address, which `open_port` knows.
+        bus: The emulated bus.
+    """
+
+    def __init__(
+        self,
+        plant: str | Plant,
+        config: BusEmulation,
+        plant_args: Mapping[str, Any] | None = None,
+        truth_path: Path | None = None,
+    ) -> None:
+        self.plant = load_plant(plant, plant_args) if isinstance(plant, str) else plant
+        super().__init__(self.plant, config, truth_path)
+        self._baud_rate: int | None = None  # None: no host has opened the port
+        self._inbox: list[bytes] = []
+        self.bus: Any = self.planned
+        self.port = f"virtual:{next(NUMBERS)}"
+        EMULATED[self.port] = self._open
+
+    def make(self, physics: Plant, config: BusEmulation, log: TruthLog) -> PlannedRobot[Any]:
+        return config.bus_type(physics, config, log, self._take, 0, self.now_ns)
+
+    def stop(self) -> None:
+        EMULATED.pop(self.port, None)
+        super().stop()
+
+    # The port
+
+    def _open(self, baud_rate: int) -> Port:
+        if self._baud_rate is not None or self.bus.unplugged(self._now_ns):
+            raise HardwareLost(f"the port {self.port} cannot be opened: it is in use, or gone")
+        self._baud_rate = baud_rate
+        return self
+
+    def write(self, data: bytes) -> None:
+        self._require_port()
+        if self._baud_rate == self.bus.baud_rate:
+            self.feed(data)
+
+    def read(self, until_ns: int) -> bytes:
+        self._require_port()
+        data = self.take_until(until_ns)
+        self._require_port()
+        return data
+
+    def flush(self) -> None:
+        self._require_port()
+        self._inbox.clear()
+
+    def close(self) -> None:
+        self._baud_rate = None
+        self._inbox.clear()
+
+    def guardian(self, off: bytes, servos: Queries, silence_s: float, answer_s: float) -> Guardian:
+        line = _GuardLine(self)
+        motors = Motors(lambda: take_torque_off(line, off, servos, answer_s), self, CUT)
+        return Guardian(lambda longest_s: VirtualChannel(self, motors, longest_s), silence_s)
+
+    def feed(self, data: bytes) -> None:
+        """Send bytes to the servos, whoever has the port."""
+        self._require_line()
+        self.bus.feed(data, self._now_ns)
+        self.bus.run_until(self._now_ns)
+
+    def take_until(self, until_ns: int) -> bytes:
+        """Return the bytes that have arrived; none if there are none until a time [ns]."""
+        self._pass(until_ns, lambda: self._inbox)
+        self._require_line()
+        data = b"".join(self._inbox)
+        self._inbox.clear()
+        return data
+
+    def _require_port(self) -> None:
+        if self._baud_rate is None or not self.host_lives:
+            raise OSError("the port is closed")
+        self._require_line()
+
+    def _require_line(self) -> None:
+        if self.bus.unplugged(self._now_ns):
+            raise OSError("the port is gone")
+
+    def _take(self, answer: bytes) -> bool:
+        self._inbox.append(answer)
+        return True
+
+
+class _GuardLine:
+    """The port in virtual time, as the guardian's own code uses it; a `Line`."""
+
+    def __init__(self, robot: VirtualRobot) -> None:
+        self.clock: Clock = robot
+        self._robot = robot
+
+    def write(self, data: bytes) -> None:
+        self._robot.feed(data)
+
+    def read(self, until_ns: int) -> bytes:
+        return self._robot.take_until(max(until_ns, self._robot.now_ns() + 1))  # time goes on

@@ -25,9 +25,9 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from sim2real.emulation.bus import BusEmulation
+from sim2real.emulation.bus import BusEmulation, VirtualRobot
+from sim2real.emulation.robot import VirtualTime
 from sim2real.emulation.truth import Kind
-from sim2real.emulation.virtual import VirtualRobot, VirtualTime
 from sim2real.errors import HardwareLost, SafetyStop
 from sim2real.hardware.device import Device, OperatingMode, Reading
 from sim2real.hardware.safety.gate import GateConfig

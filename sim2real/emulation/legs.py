@@ -1,4 +1,4 @@
-"""An emulated robot of Unitree: its motors and its IMU in planned time, and its process behind DDS in real time.
+"""An emulated robot of Unitree: its motors and its IMU, and its connections in place of DDS.
 
 A command that is written at t takes effect one actuation latency later, and a state holds the measurements of one
 sensing latency earlier.
@@ -7,30 +7,29 @@ sensing latency earlier.
 from __future__ import annotations
 
 import random
-import socket
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Final
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 
-from sim2real.emulation.plant import STATE_PERIOD_S, Body
-from sim2real.emulation.process import StopFlag, Task, serve
-from sim2real.emulation.robot import Emulation, PlannedRobot
+from sim2real.emulation.plant import STATE_PERIOD_S, Body, load_plant
+from sim2real.emulation.robot import NUMBERS, Emulation, PlannedRobot, VirtualChannel, VirtualTime
 from sim2real.emulation.truth import Kind, TruthLog
 from sim2real.errors import HardwareLost
-from sim2real.hardware.unitree.dds import PERIOD_S, Address
-from sim2real.hardware.unitree.legs import COLUMNS
+from sim2real.hardware.safety.guardian import Guardian
+from sim2real.hardware.unitree.dds import EMULATED, PERIOD_S, QUEUE, Address, DdsLink
+from sim2real.hardware.unitree.device import motors_of
+from sim2real.hardware.unitree.legs import COLUMNS, LegDrive
 from sim2real.hardware.unitree.messages import (
-    COMMAND_TOPIC,
     HEAD,
     LOW_LEVEL,
     NO_POSITION,
     NO_VELOCITY,
     SERVO,
-    STATE_TOPIC,
     LowCmd,
     LowState,
 )
@@ -53,8 +52,6 @@ class UnitreeEmulation(Emulation):
         alone_kd: Damping of the joints then [N m s/rad].
     """
 
-    serve: ClassVar[str] = "sim2real.emulation.legs:serve_legs"
-
     position_noise_rad: float = 0.0003
     velocity_noise_rad_s: float = 0.03
     gyro_noise_rad_s: float = 0.01
@@ -62,6 +59,9 @@ class UnitreeEmulation(Emulation):
     accelerometer_noise_m_s2: float = 0.05
     alone_after_s: float | None = None
     alone_kd: float = 3.0
+
+    def robot(self, plant: str, plant_args: Mapping[str, Any], truth_path: Path | None) -> VirtualLegs:
+        return VirtualLegs(plant, self, plant_args, truth_path)
 
 
 class EmulatedLegs(PlannedRobot[UnitreeEmulation]):
@@ -242,65 +242,77 @@ def _roll_pitch_yaw(q: np.ndarray) -> tuple[float, float, float]:
     return float(roll), float(pitch), float(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
 
 
-_POLL_NS: Final = 1_000_000
-_DOMAINS: Final = range(50, 230)
-"""Domains of emulators; a real robot has domain 0."""
-_LOCK_PORT: Final = 29_000
-"""A domain belongs to the process that has the UDP port of this number plus the domain's."""
-_DDS_PORT, _DDS_PORTS = 7400, 250
-"""Every program in a domain hears on this UDP port plus a number of ports for each domain (DDSI-RTPS, section 9.6)."""
+class VirtualLegs(VirtualTime):
+    """An emulated robot at `port`, from construction until `stop`.
+
+    Attributes:
+        port: The address, which `connect` knows.
+        links: The open connections.
+    """
+
+    def __init__(
+        self,
+        plant: str | Body,
+        config: UnitreeEmulation,
+        plant_args: Mapping[str, Any] | None = None,
+        truth_path: Path | None = None,
+    ) -> None:
+        body: Any = load_plant(plant, plant_args) if isinstance(plant, str) else plant
+        self.links: list[VirtualLink] = []
+        super().__init__(body, config, truth_path)
+        self.legs: Any = self.planned
+        self.address = Address("virtual", next(NUMBERS) % 233)
+        self.port = str(self.address)
+        EMULATED[self.address] = lambda mark: VirtualLink(self, mark)
+
+    def make(self, physics: Body, config: UnitreeEmulation, log: TruthLog) -> PlannedRobot[Any]:
+        return EmulatedLegs(physics, config, log, 0, self._publish, self.now_ns)
+
+    def stop(self) -> None:
+        EMULATED.pop(self.address, None)
+        super().stop()
+
+    def _publish(self, state: LowState) -> None:
+        for link in self.links:
+            link.states.append(state)
 
 
-class _Dds:
-    """The topics of a robot's low-level interface, on this machine alone; a `Connection`."""
+class VirtualLink(DdsLink):
+    """A connection of the host, or of the guardian.
 
-    inputs: tuple[int, ...] = ()
-    idle_ns = _POLL_NS
+    Attributes:
+        states: States that wait for `next_state`.
+    """
 
-    def __init__(self) -> None:
-        # Imported here: without cyclonedds, `messages` above has raised an error that names its extra.
-        from cyclonedds.domain import Domain, DomainParticipant
-        from cyclonedds.pub import DataWriter
-        from cyclonedds.sub import DataReader
-        from cyclonedds.topic import Topic
+    def __init__(self, robot: VirtualLegs, mark: str, is_guardian: bool = False) -> None:
+        self.address, self.clock, self._robot, self._mark = robot.address, robot, robot, mark.encode()
+        self._is_guardian = is_guardian
+        self.states: deque[LowState] = deque(maxlen=QUEUE)
+        robot.links.append(self)
 
-        self._lock, domain = _free_domain()
-        address = Address("lo", domain)
-        self.port, self._network = str(address), Domain(domain, address.config)
-        participant = DomainParticipant(domain)
-        self._reader = DataReader(participant, Topic(participant, COMMAND_TOPIC, LowCmd))
-        self.write = DataWriter(participant, Topic(participant, STATE_TOPIC, LowState)).write
+    def write(self, command: LowCmd) -> None:
+        self._require_open()
+        if not self._robot.legs.is_silent(self._robot.now_ns()):
+            self._robot.legs.receive(command, self._robot.now_ns())
 
-    def exchange(self, robot: EmulatedLegs, now_ns: int, ready: list[int]) -> None:
-        """Pass the host's commands on; they count from the time at which they were written."""
-        del ready
-        for message in self._reader.take(16):
-            if isinstance(message, LowCmd) and not robot.is_silent(now_ns):
-                written_ns = message.sample_info.source_timestamp  # pyright: ignore[reportAttributeAccessIssue]
-                robot.receive(message, time.monotonic_ns() - max(0, time.time_ns() - written_ns))
+    def next_state(self, timeout_s: float) -> LowState | None:
+        self._require_open()
+        if timeout_s > 0.0:
+            self._robot._pass(self._robot.now_ns() + max(1, round(1e9 * timeout_s)), lambda: self.states)
+        return self.states.popleft() if self.states else None
+
+    def other_writers(self) -> list[str]:
+        self._require_open()
+        return [link._mark.decode() for link in self._robot.links if link._mark != self._mark]
+
+    def guardian(self, drive: LegDrive, silence_s: float, settle_s: float) -> Guardian:
+        motors = motors_of(VirtualLink(self._robot, self._mark.decode(), is_guardian=True), drive)
+        return Guardian(lambda longest_s: VirtualChannel(self._robot, motors, longest_s), silence_s, settle_s)
 
     def close(self) -> None:
-        """Leave the domain."""
-        del self._reader, self.write, self._network
-        self._lock.close()
+        if self in self._robot.links:
+            self._robot.links.remove(self)
 
-
-def serve_legs(task: Task, config: UnitreeEmulation, stop: StopFlag) -> None:
-    """Emulate a robot behind the topics of its low-level interface until the flag is set."""
-    serve(task, config, stop, _Dds, lambda body, truth, ns, dds: EmulatedLegs(body, config, truth, ns, dds.write))
-
-
-def _free_domain() -> tuple[socket.socket, int]:
-    """Return a domain that no program of this machine uses, not even an earlier robot's guardian, and its socket."""
-    for domain in _DOMAINS:
-        lock, heard = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
-        try:
-            lock.bind(("127.0.0.1", _LOCK_PORT + domain))
-            heard.bind(("", _DDS_PORT + _DDS_PORTS * domain))
-        except OSError:
-            lock.close()
-            continue
-        finally:
-            heard.close()
-        return lock, domain
-    raise HardwareLost("all DDS domains of this machine have an emulator", hint="end emulators that still run")
+    def _require_open(self) -> None:
+        if self not in self._robot.links or not (self._is_guardian or self._robot.host_lives):
+            raise HardwareLost(f"the robot on {self.address} is not open", hint="call open first")

@@ -1,14 +1,12 @@
 """The emulator's log of true states and true latencies, the reference for other results.
 
-The file is one line of JSON (the header), followed by rows of fixed size, flushed every 0.25 s, so that a file that was
-cut off can be read. All times are CLOCK_MONOTONIC nanoseconds, which all processes of a machine share.
+The file is one line of JSON (the header), followed by rows of fixed size, so that a file that was cut off can be read.
+All times are nanoseconds of the robot's clock.
 """
 
 import contextlib
 import json
-import queue
 import struct
-import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -19,7 +17,6 @@ import numpy as np
 
 from sim2real.errors import Sim2RealError
 
-FLUSH_PERIOD_NS: Final = 250_000_000
 _FIXED: Final = "<BB6xqqqq"
 _MIN_VALUES: Final = 3  # a sample's position, velocity and load
 
@@ -66,7 +63,7 @@ def _dtype(values: int) -> np.dtype:
 
 
 class TruthLog:
-    """Appends rows to a truth file in a separate thread, so that a busy disk does not hold up a servo's answers.
+    """Appends rows to a truth file; where the file cannot be written it ends, and the emulated robot goes on.
 
     Args:
         path: The file; an existing one is replaced.
@@ -77,14 +74,8 @@ class TruthLog:
         self._values = max(_MIN_VALUES, len(header["state_names"]))
         self._struct = struct.Struct(f"{_FIXED}{self._values}d")
         self._padding = (0.0,) * self._values
-        self._rows: list[bytes] = []
-        self._flushed_ns = 0
-        self._file = path.open("wb")
+        self._file = path.open("wb", buffering=1 << 16)
         self._file.write(json.dumps({**header, "values": self._values}).encode() + b"\n")
-        self._file.flush()
-        self._batches: queue.SimpleQueue[list[bytes] | None] = queue.SimpleQueue()
-        self._writer = threading.Thread(target=self._write_batches, name="sim2real:truth", daemon=True)
-        self._writer.start()
 
     def write(
         self,
@@ -96,34 +87,18 @@ class TruthLog:
         late_ns: int,
         values: Sequence[float] = (),
     ) -> None:
-        """Buffer one row; see `Kind` for times and values. The ``servo_id`` of the whole plant is 0."""
+        """Write one row; see `Kind` for times and values. The ``servo_id`` of the whole plant is 0."""
         padded = (*values, *self._padding[len(values) :])
-        self._rows.append(self._struct.pack(kind, servo_id, t_host_ns, t_ns, t_done_ns, late_ns, *padded))
+        with contextlib.suppress(OSError):
+            self._file.write(self._struct.pack(kind, servo_id, t_host_ns, t_ns, t_done_ns, late_ns, *padded))
 
-    def flush_if_due(self, now_ns: int) -> None:
-        """Pass the buffered rows to the writer if the last time was at least 0.25 s ago."""
-        if now_ns - self._flushed_ns >= FLUSH_PERIOD_NS:
-            self._flushed_ns = now_ns
-            self._flush()
+    def flush(self) -> None:
+        """Pass all rows on to the file."""
+        with contextlib.suppress(OSError):
+            self._file.flush()
 
     def close(self) -> None:
-        """Write the remaining rows and close the file; may be called twice."""
-        if self._writer.is_alive():
-            self._flush()
-            self._batches.put(None)
-            self._writer.join()
-
-    def _flush(self) -> None:
-        if self._writer.is_alive():
-            self._batches.put(self._rows)
-        self._rows = []
-
-    def _write_batches(self) -> None:
-        """Write all batches; if that fails, the log ends there, and the emulated robot goes on."""
-        with contextlib.suppress(OSError):
-            while (rows := self._batches.get()) is not None:
-                self._file.write(b"".join(rows))
-                self._file.flush()
+        """Close the file; may be called twice."""
         with contextlib.suppress(OSError):
             self._file.close()
 

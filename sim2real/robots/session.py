@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any, Self
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
-    from sim2real.emulation.process import EmbeddedRobot
-    from sim2real.emulation.robot import Emulation
+    from sim2real.emulation.robot import Emulation, VirtualTime
     from sim2real.hardware.device import Device
     from sim2real.hardware.joint import Joint
     from sim2real.hardware.safety.gate import GateConfig
@@ -51,7 +50,7 @@ class Session:
 
     Attributes:
         rig: The motors behind the safety gate.
-        embedded: The process of the emulated robot, for the port ``embedded``; else None.
+        embedded: The running emulated robot, for the port ``embedded``; else None.
 
     Args:
         device: Returns the device on a port, not opened yet.
@@ -76,19 +75,18 @@ class Session:
         joints: Sequence[Joint] = (),
     ) -> None:
         # Imported here: training also makes robots, and must not import their drivers.
-        from sim2real.emulation.process import EmbeddedRobot
         from sim2real.hardware.safety.rig import Rig
 
         self._stack = ExitStack()
-        self.embedded: EmbeddedRobot | None = None
+        self.embedded: VirtualTime | None = None
         with ExitStack() as opening:
             if port == "embedded":
                 if embedded is None:
                     raise UsageError("this robot has no embedded twin", hint="name its port with --port")
                 config = replace(embedded.emulator, seed=seed)
-                self.embedded = opening.enter_context(
-                    EmbeddedRobot(embedded.plant, config, embedded.plant_args, truth_path)
-                )
+                truth_path.parent.mkdir(parents=True, exist_ok=True)
+                robot = config.robot(embedded.plant, embedded.plant_args, truth_path)
+                self.embedded = opening.enter_context(robot)
                 port = self.embedded.port
                 # Wait until the last command, torque off, has taken effect, so that it is in the truth file.
                 lasts_s = config.actuation_latency_s + config.actuation_jitter_s + 0.01

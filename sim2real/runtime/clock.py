@@ -31,8 +31,8 @@ class Clock(Enum):
 class MonotonicClock:
     """Ticks [us] since the episode's start, on the machine's monotonic clock; negative before it.
 
-    The threads of a graph read the time and wait for each other through this class alone: tests give ``AsyncGraph`` one
-    whose time passes only while every thread waits.
+    The threads of a graph read the time and wait for each other through this class alone: that of an emulated robot
+    passes only while every thread waits, see ``VirtualClock``.
     """
 
     event, condition, lock = threading.Event, threading.Condition, threading.Lock
@@ -40,8 +40,7 @@ class MonotonicClock:
     def __init__(self) -> None:
         self.origin_ns = self.monotonic_ns()
 
-    @staticmethod
-    def monotonic_ns() -> int:
+    def monotonic_ns(self) -> int:
         """Return the machine's monotonic time [ns]."""
         return time.monotonic_ns()
 
@@ -60,6 +59,10 @@ class MonotonicClock:
     def now_s(self) -> float:
         """Return the time [s]."""
         return (self.monotonic_ns() - self.origin_ns) / 1e9
+
+    def start(self, thread: threading.Thread) -> None:
+        """Start a thread of the graph."""
+        thread.start()
 
     def keep_time(self) -> None:
         """Give the calling thread a real-time priority; see the function."""

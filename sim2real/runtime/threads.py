@@ -320,7 +320,8 @@ class NodeThread(threading.Thread):
             done.set()
 
         try:
-            threading.Thread(target=make_safe, name=f"sim2real:stop of {self.node.name}", daemon=True).start()
+            helper = threading.Thread(target=make_safe, name=f"sim2real:stop of {self.node.name}", daemon=True)
+            self.shared.clock.start(helper)
         except RuntimeError:  # the system has no thread left
             make_safe()
         done.wait(timeout_s)

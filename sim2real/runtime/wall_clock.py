@@ -80,9 +80,9 @@ class WallClockRun:
             self._process.enter_context(realtime())
             deadline = self._clock.monotonic_s() + timeout_s
             # Under the lock: stop() in another thread then finds either no thread started or all of them.
-            self._watchdog.start()
+            self._clock.start(self._watchdog)
             for thread in self._threads.values():
-                thread.start()
+                self._clock.start(thread)
         for name, thread in self._threads.items():
             while not (thread.ready.wait(_POLL_S) or self.ended):
                 if self._clock.monotonic_s() > deadline:

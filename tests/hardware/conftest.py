@@ -1,8 +1,8 @@
 import pytest
 from virtual_bus import PLANTS, VirtualBus
 
+from sim2real.emulation.bus import VirtualRobot
 from sim2real.emulation.dynamixel import EmulatorConfig
-from sim2real.emulation.virtual import VirtualRobot
 from sim2real.hardware.bus.port import BusConfig
 from sim2real.hardware.dynamixel import DynamixelServos, VoltageDrive
 

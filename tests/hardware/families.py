@@ -12,10 +12,9 @@ from turntable.odrive_emulation import ODriveEmulation
 from turntable.plant import Turntable
 
 from pipelines.go2.plant import LYING, Go2Body
-from sim2real.emulation.bus import BusEmulation
+from sim2real.emulation.bus import BusEmulation, VirtualRobot
 from sim2real.emulation.dynamixel import EmulatorConfig
 from sim2real.emulation.feetech import StsEmulation
-from sim2real.emulation.virtual import VirtualRobot
 from sim2real.hardware import dynamixel as dynamixel
 from sim2real.hardware import feetech as feetech
 from sim2real.hardware.bus.port import BusConfig
@@ -85,7 +84,7 @@ class _Legs(Family):
     """Legs of a Go2 over DDS, which damp before their torque goes off."""
 
     def robot(self, plant: str = "", settings: Mapping[str, Any] | None = None, **plant_args: Any) -> Any:
-        from sim2real.emulation.virtual_legs import VirtualLegs
+        from sim2real.emulation.legs import VirtualLegs
 
         return VirtualLegs(Go2Body("stand"), self.emulation(alone_after_s=None, **(settings or {})))
 

@@ -66,8 +66,7 @@ class TestUnitreeLegs(DeviceConformance):
 
     def make_robot(self, truth_path, **settings):
         pytest.importorskip("cyclonedds")
-        from sim2real.emulation.legs import UnitreeEmulation
-        from sim2real.emulation.virtual_legs import VirtualLegs
+        from sim2real.emulation.legs import UnitreeEmulation, VirtualLegs
 
         # Its motors go on when their host dies: the guardian must cope with that.
-        return VirtualLegs(Go2Body("floor"), UnitreeEmulation(alone_after_s=None, **settings), truth_path)
+        return VirtualLegs(Go2Body("floor"), UnitreeEmulation(alone_after_s=None, **settings), None, truth_path)

@@ -10,7 +10,6 @@ import sys
 import numpy as np
 import pytest
 
-from sim2real.emulation import process as emulator
 from sim2real.emulation.dynamixel import EmulatorConfig
 from sim2real.emulation.truth import Kind
 from sim2real.hardware import dynamixel as reg
@@ -21,8 +20,8 @@ from sim2real.runtime import clock
 
 
 def test_it_never_waits_for_the_threads_that_it_watches():
-    """An emulated servo comes between: a real one waits for nobody. Where its priority is not allowed none is taken."""
-    assert clock._PRIORITY < emulator._REAL_TIME_PRIORITY < guardian.PRIORITY == clock._GUARDIAN_PRIORITY
+    """Where its priority is not allowed none is taken."""
+    assert clock._PRIORITY < guardian.PRIORITY == clock._GUARDIAN_PRIORITY
 
 
 def test_it_needs_little_and_so_starts_soon():

@@ -4,8 +4,8 @@ import pytest
 from dynamixel_sdk import GroupSyncRead, GroupSyncWrite, PacketHandler, PortHandler
 from virtual_bus import PLANTS
 
+from sim2real.emulation.bus import VirtualRobot
 from sim2real.emulation.dynamixel import EmulatorConfig
-from sim2real.emulation.virtual import VirtualRobot
 from sim2real.hardware import dynamixel as reg
 from sim2real.hardware.bus.packets import Instruction, Parser
 from sim2real.hardware.bus.port import open_port

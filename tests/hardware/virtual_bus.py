@@ -2,9 +2,8 @@ from functools import cached_property
 from pathlib import Path
 
 from sim2real.emulation.plant import load_plant
-from sim2real.emulation.robot import Emulation, PlannedRobot, truth_header
+from sim2real.emulation.robot import Emulation, PlannedRobot, VirtualTime, truth_header
 from sim2real.emulation.truth import TruthLog, read_truth
-from sim2real.emulation.virtual import VirtualTime
 from sim2real.hardware.device import Device
 
 PLANTS = Path(__file__).parent / "plants.py"

@@ -25,7 +25,7 @@ GUIDE = Path(__file__).parents[2] / "docs/guides/walk.md"
 
 
 @pytest.mark.night  # `make test` drives the device in test_unitree_device.py, and walks in test_rough_ground.py
-def test_the_shipped_policy_walks_and_lies_down(tmp_path, capsys, virtual_robots):
+def test_the_shipped_policy_walks_and_lies_down(tmp_path, capsys):
     (command,) = re.findall(r"^    sim2real (deploy .*)$", GUIDE.read_text(), re.MULTILINE)
     assert cli.main([*shlex.split(command), "--runs", str(tmp_path)]) == 0
     output = capsys.readouterr()
@@ -79,7 +79,7 @@ def test_a_robot_that_does_not_walk_refuses_a_velocity(tmp_path, capsys):
 
 
 @pytest.mark.night  # its legs move in test_unitree_device.py
-def test_a_recording_moves_the_legs_in_a_stand(tmp_path, virtual_robots):
+def test_a_recording_moves_the_legs_in_a_stand(tmp_path):
     command, *_ = re.findall(r"^    sim2real (record .*)$", GUIDE.read_text(), re.MULTILINE)
     assert cli.main([*shlex.split(command), "--runs", str(tmp_path)]) == 0
     (folder,) = (tmp_path / "go2").glob("*/record")
@@ -96,7 +96,7 @@ def test_a_recording_moves_the_legs_in_a_stand(tmp_path, virtual_robots):
 
 
 @pytest.mark.night
-def test_a_run_records_identifies_and_deploys_the_shipped_policy(tmp_path, capsys, virtual_robots):
+def test_a_run_records_identifies_and_deploys_the_shipped_policy(tmp_path, capsys):
     """The smaller tests are those of the model in a stand, of the run's stages, and of the deployment above."""
     (command,) = re.findall(r"^    sim2real (run go2.*)$", GUIDE.read_text(), re.MULTILINE)
     assert cli.main([*shlex.split(command), "--runs", str(tmp_path)]) == 0
@@ -118,7 +118,7 @@ def test_a_run_records_identifies_and_deploys_the_shipped_policy(tmp_path, capsy
 
 
 @pytest.mark.night  # test_weighing.py has the load from a log of the emulator's clock
-def test_the_load_of_a_robot_on_its_feet(tmp_path, capsys, virtual_robots):
+def test_the_load_of_a_robot_on_its_feet(tmp_path, capsys):
     logs = []
     for number, excitation in enumerate(("multisine", "standing")):
         line = ["record", "go2", "--excitation", excitation, "--runs", str(tmp_path / str(number))]

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 
 import pytest
 
+from sim2real.emulation.bus import VirtualRobot
 from sim2real.emulation.dynamixel import EmulatorConfig
-from sim2real.emulation.virtual import VirtualRobot
 from sim2real.errors import SafetyStop
 from sim2real.hardware import dynamixel as reg
 from sim2real.hardware.bus.port import BusConfig

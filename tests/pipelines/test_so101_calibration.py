@@ -7,9 +7,9 @@ import pytest
 import so101_person
 
 from sim2real.commands.new import calibrate
+from sim2real.emulation.bus import VirtualRobot
 from sim2real.emulation.feetech import StsEmulation
 from sim2real.emulation.truth import Kind
-from sim2real.emulation.virtual import VirtualRobot
 from sim2real.errors import HardwareLost, Sim2RealError
 from sim2real.hardware.device import OperatingMode
 from sim2real.stages.load import load_module, load_robot

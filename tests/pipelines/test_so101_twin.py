@@ -7,8 +7,8 @@ import pytest
 import so101_person
 
 from sim2real import cli
+from sim2real.emulation.bus import VirtualRobot
 from sim2real.emulation.truth import Kind
-from sim2real.emulation.virtual import VirtualRobot
 from sim2real.hardware.device import OperatingMode
 from sim2real.stages.load import load_module, load_robot
 
@@ -17,15 +17,15 @@ QUESTION = "press Enter"
 
 
 @pytest.fixture
-def arm(tmp_path, monkeypatch, virtual_robots):
+def arm(tmp_path, monkeypatch):
     """An arm whose person begins 60 s after its start."""
     hand = tmp_path / "hand.npz"
     so101_person.write_motion(hand, begin_s=60.0)
     embedded = load_module(SO101.name, "robot").embedded()
     monkeypatch.setenv("SO101_CALIBRATION", str(SO101.folder / "calibration.json"))
     monkeypatch.chdir(tmp_path)
-    virtual_robots.append(VirtualRobot(embedded.plant, embedded.emulator, {"hand": str(hand)}, tmp_path / "truth.bin"))
-    return virtual_robots[-1]
+    with VirtualRobot(embedded.plant, embedded.emulator, {"hand": str(hand)}, tmp_path / "truth.bin") as robot:
+        yield robot
 
 
 def new(arm, answer, capsys, monkeypatch):

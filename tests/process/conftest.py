@@ -1,37 +1,21 @@
 """Command lines as processes of their own, and robots that outlive their host."""
 
-import json
 import os
 import subprocess
 import sys
-from dataclasses import asdict
 
 import pytest
+from emulator import EmulatedProcess
 
-from sim2real.emulation.truth import read_truth
 from sim2real.stages.load import load_robot
 
 
 @pytest.fixture
 def lone_robot(tmp_path):
-    """Start an emulated pendulum that does not end with its host; returns its port, and how to stop it."""
+    """An emulated pendulum that does not end with its host."""
     embedded = load_robot("pendulum").drive.embedded
-    path = tmp_path / "truth.bin"
-    task = {"emulation": "sim2real.emulation.dynamixel:EmulatorConfig", "settings": asdict(embedded.emulator)}
-    task |= {"plant": embedded.plant, "truth": str(path)}
-    command = [sys.executable, "-m", "sim2real.emulation.process", json.dumps(task)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    port = json.loads(process.stdout.readline())["port"]
-
-    def end():
-        process.terminate()
-        process.wait(60)
-        return read_truth(path)
-
-    yield port, end
-    process.kill()
-    process.communicate()
+    with EmulatedProcess(embedded.plant, embedded.emulator, {}, tmp_path / "truth.bin") as robot:
+        yield robot
 
 
 @pytest.fixture

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from emulator import EmulatedProcess
 
 from sim2real.emulation.dynamixel import EmulatorConfig
-from sim2real.emulation.process import EmbeddedRobot
 from sim2real.emulation.truth import Kind
 from sim2real.errors import SAFETY_STOP
 from sim2real.hardware.device import OperatingMode
@@ -60,7 +60,7 @@ except Sim2RealError as error:
 def turning(tmp_path):
     """Servos, the process that turns them, and the number of the guardian's process."""
     config = EmulatorConfig(model_number=XL330, actuation_latency_s=0.0)  # off has had its effect when it is confirmed
-    with EmbeddedRobot(f"{PLANTS}:FirstOrder", config, {"ids": IDS}, tmp_path / "truth.bin") as robot:
+    with EmulatedProcess(f"{PLANTS}:FirstOrder", config, {"ids": IDS}, tmp_path / "truth.bin") as robot:
         code = HOST.format(port=robot.port, silence_s=SILENCE_S)
         host = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         guardian = host.stdout.readline().strip()

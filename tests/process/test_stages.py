@@ -39,7 +39,7 @@ def assert_ended_in_order(folder, log, code):
 
 
 def test_ctrl_c_twice_ends_a_recording_in_order(tmp_path, start_cli):
-    process = start_cli("record", "pendulum", "--duration-s", 60, "--runs", tmp_path, *PATIENT)
+    process = start_cli("record", "pendulum", "--duration-s", 3600, "--runs", tmp_path)
     log = wait_until_running(tmp_path, LOG, process)
     process.send_signal(signal.SIGINT)
     time.sleep(0.01)
@@ -50,7 +50,7 @@ def test_ctrl_c_twice_ends_a_recording_in_order(tmp_path, start_cli):
 
 
 def test_sigterm_ends_a_deployment_in_order(tmp_path, start_cli):
-    flags = ["--bundle", make_bundle("pendulum", tmp_path, 0.5), "--duration-s", 60, "--no-measure-delay", *PATIENT]
+    flags = ["--bundle", make_bundle("pendulum", tmp_path, 0.5), "--duration-s", 3600, "--no-measure-delay"]
     process = start_cli("deploy", "pendulum", *flags, "--runs", tmp_path)
     log = wait_until_running(tmp_path, "pendulum/*/deploy/episode_0.mcap", process)
     process.send_signal(signal.SIGTERM)
@@ -62,8 +62,9 @@ def test_sigterm_ends_a_deployment_in_order(tmp_path, start_cli):
 @pytest.mark.night
 def test_a_killed_recording_leaves_what_was_written(tmp_path, lone_robot, start_cli):
     """How much is lost at most is tested for the log's writer, in tests/log/test_log_damage.py."""
-    port, end_robot = lone_robot
-    process = start_cli("record", "pendulum", "--port", port, "--duration-s", 60, "--runs", tmp_path, *PATIENT)
+    process = start_cli(
+        "record", "pendulum", "--port", lone_robot.port, "--duration-s", 60, "--runs", tmp_path, *PATIENT
+    )
     log = wait_until_running(tmp_path, LOG, process)
     process.kill()
     process.wait()
@@ -73,7 +74,8 @@ def test_a_killed_recording_leaves_what_was_written(tmp_path, lone_robot, start_
     with pytest.warns(TruncatedLogWarning, match="has no end"):
         episode = read_log(log)
     # Each command that reached the motor in this time stands in the log.
-    effects, monotonic_ns = end_robot().of(Kind.EFFECT), time.monotonic_ns() - time.time_ns()
+    lone_robot.stop()
+    effects, monotonic_ns = lone_robot.truth().of(Kind.EFFECT), time.monotonic_ns() - time.time_ns()
     arrived_us = (effects["t_host_ns"] - monotonic_ns - episode.metadata["log"]["epoch_ns"]) / 1e3
     steps = episode.steps["actuator"]
     inside = arrived_us[(arrived_us >= steps.start[0] + 1e3) & (arrived_us < steps.end[-1] - 1e3)]
@@ -83,10 +85,11 @@ def test_a_killed_recording_leaves_what_was_written(tmp_path, lone_robot, start_
 
 
 def test_an_unplugged_bus_ends_the_recording(tmp_path, lone_robot, start_cli):
-    port, end_robot = lone_robot
-    process = start_cli("record", "pendulum", "--port", port, "--duration-s", 60, "--runs", tmp_path, *PATIENT)
+    process = start_cli(
+        "record", "pendulum", "--port", lone_robot.port, "--duration-s", 60, "--runs", tmp_path, *PATIENT
+    )
     log = wait_until_running(tmp_path, LOG, process)
-    end_robot()  # with its end of the terminal
+    lone_robot.stop()  # with its end of the terminal
     said = process.communicate()[1]
     assert process.returncode == errors.HARDWARE_LOST
     assert "Traceback" not in said
@@ -121,7 +124,7 @@ def test_a_viewer_that_is_killed_costs_no_row(tmp_path, capsys):
 
     thread = threading.Thread(target=kill_the_viewer, daemon=True)
     thread.start()
-    flags = ["--duration-s", "3", "--runs", str(tmp_path / "runs"), "--view", str(tmp_path / "live.rrd"), *PATIENT]
+    flags = ["--duration-s", "60", "--runs", str(tmp_path / "runs"), "--view", str(tmp_path / "live.rrd")]
     assert cli.main(["record", "pendulum", *flags]) == 0
     thread.join()
     folder = newest(tmp_path / "runs", "pendulum", "record").folder
@@ -144,7 +147,7 @@ def test_a_robot_is_recorded_and_moved_by_a_policy_without_jax(tmp_path):
         done = subprocess.run(line, cwd=tmp_path, env=outside, capture_output=True, text=True)
         return done.returncode, done.stdout + done.stderr
 
-    flags = ["--duration-s", "1", "--runs", "runs", *PATIENT]
+    flags = ["--duration-s", "1", "--runs", "runs"]
     code, said = call("record", "pendulum", *flags)
     assert code == errors.OK, said
     (log,) = tmp_path.glob("runs/" + LOG)

@@ -17,10 +17,10 @@ from cyclonedds.domain import DomainParticipant  # noqa: E402
 from cyclonedds.pub import DataWriter  # noqa: E402
 from cyclonedds.sub import DataReader  # noqa: E402
 from cyclonedds.topic import Topic  # noqa: E402
+from emulator import EmulatedProcess  # noqa: E402
 from unitree_bench import CONTROLS, DAMPS, OFF, ways  # noqa: E402
 
 from sim2real.emulation.legs import UnitreeEmulation  # noqa: E402
-from sim2real.emulation.process import EmbeddedRobot  # noqa: E402
 from sim2real.emulation.truth import Kind  # noqa: E402
 from sim2real.errors import HardwareLost  # noqa: E402
 from sim2real.hardware.unitree import device  # noqa: E402
@@ -36,12 +36,12 @@ BODY = "pipelines.go2.plant:Go2Body"
 VERSION = "1.0.1"
 
 
-def test_it_starts_in_a_domain_without_programs_and_one_that_is_not_there_is_lost(monkeypatch):
+def test_it_starts_in_a_domain_without_programs_and_one_that_is_not_there_is_lost(tmp_path, monkeypatch):
     """The guardian of an earlier robot may still be in that robot's: it would count as a second program."""
-    with EmbeddedRobot(BODY, UnitreeEmulation()) as first:
+    with EmulatedProcess(BODY, UnitreeEmulation(), {}, tmp_path / "truth.bin") as first:
         left_behind = DdsLink(Address.parse(first.port), "of an earlier robot")
     try:
-        with EmbeddedRobot(BODY, UnitreeEmulation()) as second:
+        with EmulatedProcess(BODY, UnitreeEmulation(), {}, tmp_path / "truth.bin") as second:
             assert second.port != first.port
             link = DdsLink(Address.parse(second.port), "another")
             assert link.next_state(60.0) is not None
@@ -81,9 +81,9 @@ def unitree_sdk():
 
 
 @pytest.mark.night
-def test_unitrees_own_client_lets_the_emulated_robot_stand_up(unitree_sdk):
+def test_unitrees_own_client_lets_the_emulated_robot_stand_up(tmp_path, unitree_sdk):
     client = Path(__file__).with_name("unitree_client.py")
-    with EmbeddedRobot(BODY, UnitreeEmulation(0.004, 0.006, 0.0005)) as robot:
+    with EmulatedProcess(BODY, UnitreeEmulation(0.004, 0.006, 0.0005), {}, tmp_path / "truth.bin") as robot:
         command = [sys.executable, client, robot.port.removeprefix("lo:")]
         done = subprocess.run(
             command, capture_output=True, text=True, timeout=60, env={"PYTHONPATH": str(unitree_sdk)}, check=False
@@ -164,7 +164,7 @@ with Rig(device, gate) as rig:
 )
 def test_a_robot_that_stands_sinks_before_its_motors_switch_off(tmp_path, number):
     config, log = UnitreeEmulation(alone_after_s=None), tmp_path / "log.mcap"
-    robot = EmbeddedRobot(BODY, config, {"place": "floor"}, tmp_path / "truth.bin")
+    robot = EmulatedProcess(BODY, config, {"place": "floor"}, tmp_path / "truth.bin")
     code = HOST.format(port=robot.port, log=str(log))
     host = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert host.stdout.readline() == "on\n", host.stderr.read()

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim2real.emulation.virtual import VirtualRobot
+from sim2real.emulation.bus import VirtualRobot
 from sim2real.hardware.safety.rig import Rig
 from sim2real.stages.load import load_robot
 
@@ -148,8 +148,7 @@ class Go2(Arm):
 
     def robot(self, seed, plant=None, **faults):
         from pipelines.go2.plant import Go2Body
-        from sim2real.emulation.legs import UnitreeEmulation
-        from sim2real.emulation.virtual_legs import VirtualLegs
+        from sim2real.emulation.legs import UnitreeEmulation, VirtualLegs
 
         return VirtualLegs(Go2Body("stand", seed=(plant or {}).get("seed")), UnitreeEmulation(seed=seed, **faults))
 

@@ -11,7 +11,7 @@ from sim2real.stages.load import load_robot
     "name",
     ["pendulum", *(pytest.param(n, marks=pytest.mark.night) for n in ("arm", "so101")), "disk", "xl330", "so101_log"],
 )
-def test_every_pipeline_here_has_a_robot(name, tmp_path, virtual_robots):
+def test_every_pipeline_here_has_a_robot(name, tmp_path):
     pipeline = load_robot(name)
     testing.check_robot(pipeline, tmp_path, pipeline.defaults.record.gate)
 

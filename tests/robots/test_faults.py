@@ -104,7 +104,7 @@ class Strike:
         elif self.fault == "collides":
             self.robot.block(emulated)
         elif self.fault == "another master":
-            from sim2real.emulation.virtual_legs import VirtualLink
+            from sim2real.emulation.legs import VirtualLink
 
             VirtualLink(emulated, "another")
 

@@ -5,7 +5,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from virtual_stages import virtual_stages
 
 from sim2real.artifacts.timing import Timing
 from sim2real.emulation.truth import Kind, read_truth
@@ -61,7 +60,7 @@ def episodes(arm, tmp_path_factory):
     folder, robot = tmp_path_factory.mktemp("arm"), arm
     truth, logs = folder / "truth.bin", (folder / "recorded.mcap", folder / "deployed.mcap")
     policy = Steady([1.0, -0.5, 0.25])
-    with virtual_stages(), robot.drive.connect("embedded", GATE, truth, 3) as session:
+    with robot.drive.connect("embedded", GATE, truth, 3) as session:
         range_ = session.rig.gate.config.range
         config = Config()
         robot.drive.prepare(session, 5.0)
@@ -173,7 +172,7 @@ def test_a_joint_without_weight_is_brought_back_to_where_episodes_start(episodes
 
 
 @pytest.mark.parametrize("why", ["zero of the encoder", "rest that does not hold"])
-def test_an_arm_that_rests_somewhere_else_is_refused(arm, tmp_path, why, virtual_robots):
+def test_an_arm_that_rests_somewhere_else_is_refused(arm, tmp_path, why):
     """Brought to where it should rest, the shoulder falls."""
     if why.startswith("zero"):
         robot = with_drive(arm, zero_count=(2048, 2048 - 600, 2048))

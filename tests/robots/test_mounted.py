@@ -30,7 +30,7 @@ def test_a_twins_servos_are_those_of_the_data_sheet_whatever_their_gears(pair):
     assert one.truth() == pytest.approx({n: v * factors[n.split("_")[0]] for n, v in pair.nominal().items()}, rel=1e-5)
 
 
-def test_goals_and_limits_are_the_joints_on_the_bus_too(arm, tmp_path, virtual_robots):
+def test_goals_and_limits_are_the_joints_on_the_bus_too(arm, tmp_path):
     """The servos turn up to twice as far, some of them the other way; the true joints go where they are told."""
     robot = arm
     joints = (Joint("pan", 0.5, -1, 1.5), Joint("shoulder", -0.2, 1, 2.0), Joint("elbow", 0.1, -1, 0.8))

@@ -129,7 +129,7 @@ def test_files_without_a_motion_are_refused(tmp_path):
 
 
 @pytest.mark.night  # an arm plays one below
-def test_a_recorded_motion_of_the_pendulum_is_checked_and_played(tmp_path, capsys, virtual_robots):
+def test_a_recorded_motion_of_the_pendulum_is_checked_and_played(tmp_path, capsys):
     t_s = np.arange(0.0, 3.0, 0.02)
     volts = 1.2 * np.sin(2 * np.pi * 0.7 * t_s)
     np.savetxt(tmp_path / "v.csv", np.column_stack([t_s, volts]), delimiter=",", header="t_s,command", comments="")
@@ -142,7 +142,7 @@ def test_a_recorded_motion_of_the_pendulum_is_checked_and_played(tmp_path, capsy
     assert log.duration_s == pytest.approx(3.0, abs=0.05)
 
 
-def test_a_log_is_a_motion_that_the_arm_reaches_slowly(tmp_path, virtual_robots):
+def test_a_log_is_a_motion_that_the_arm_reaches_slowly(tmp_path):
     """As a recording by hand: a column of positions, here from a table."""
     path = write(tmp_path / "motion.csv", wave(0.7), unit="rad")
     rows = goals(path)

@@ -1,4 +1,4 @@
-"""``record`` and ``deploy`` on robots in virtual time: what moves, how it ends, what is written."""
+"""``record`` and ``deploy`` on embedded robots: what moves, how it ends, what is written."""
 
 import contextlib
 import io
@@ -22,6 +22,14 @@ from sim2real.stages.session.excitation import played
 from sim2real.view.delay_parts import parts_of
 
 
+@pytest.fixture
+def clocks(monkeypatch):
+    """The clocks of the episodes that a test runs on embedded robots."""
+    made, kind = [], episode.VirtualClock
+    monkeypatch.setattr(episode, "VirtualClock", lambda robot: made.append(kind(robot)) or made[-1])
+    return made
+
+
 def call(root, command, pipeline, *flags):
     """Run a stage; return its exit code, what it said, and its folder."""
     out, err = io.StringIO(), io.StringIO()
@@ -35,12 +43,12 @@ def deploy(root, pipeline, bundle, *flags):
     return call(root, "deploy", pipeline, "--bundle", bundle, "--episodes", 1, *flags)
 
 
-def test_strict_timing_ends_with_its_code_and_a_complete_log(tmp_path, virtual_robots, monkeypatch):
+def test_strict_timing_ends_with_its_code_and_a_complete_log(tmp_path, clocks, monkeypatch):
     step = Excitation.step
 
     def slow(self, step_state):
         if step_state.seq % 10 == 9:
-            virtual_robots[0].threads.sleep(0.03)
+            clocks[0].event().wait(0.03)
         return step(self, step_state)
 
     monkeypatch.setattr(Excitation, "step", slow)
@@ -53,7 +61,16 @@ def test_strict_timing_ends_with_its_code_and_a_complete_log(tmp_path, virtual_r
     assert_torque_ends_off(read_truth(folder / "truth.bin"))
 
 
-def test_a_dry_run_sends_nothing_that_moves_and_is_no_recording(tmp_path, virtual_robots):
+def test_an_embedded_robot_does_the_same_each_time(tmp_path):
+    first, second = (call(tmp_path / name, "record", "arm", "--duration-s", 2)[2] for name in "ab")
+    assert (first / "truth.bin").read_bytes() == (second / "truth.bin").read_bytes()
+    once, again = (read_log(folder / "session.mcap") for folder in (first, second))
+    for name, steps in once.steps.items():
+        assert len(steps) == 100
+        np.testing.assert_array_equal(steps.start, again.steps[name].start)
+
+
+def test_a_dry_run_sends_nothing_that_moves_and_is_no_recording(tmp_path):
     """What a device without torque writes to its bus is in tests/hardware/test_withheld.py."""
     flags = ["--duration-s", 1, "--amplitude", 2, "--gate.slew-per-s", 5]
     code, said, folder = call(tmp_path, "record", "pendulum", "--dry-run", *flags)
@@ -78,7 +95,7 @@ def test_a_dry_run_sends_nothing_that_moves_and_is_no_recording(tmp_path, virtua
     assert "Dry run" in (folder.parent / "report.html").read_text(encoding="utf-8")
 
 
-def test_a_robot_that_leans_too_far_is_stopped(tmp_path, virtual_robots, monkeypatch):
+def test_a_robot_that_leans_too_far_is_stopped(tmp_path, monkeypatch):
     agent = type(load_robot("pendulum").agent)
     from_hanging = lambda observation: float(np.arctan2(abs(observation[1]), -observation[0]))  # noqa: E731
     monkeypatch.setattr(agent, "tilt_rad", staticmethod(from_hanging), raising=False)
@@ -92,11 +109,11 @@ def test_a_robot_that_leans_too_far_is_stopped(tmp_path, virtual_robots, monkeyp
     assert read_log(folder / "episode_0.mcap").complete
 
 
-def test_a_robot_that_would_fall_is_held_until_it_is_told(tmp_path, virtual_robots, monkeypatch):
+def test_a_robot_that_would_fall_is_held_until_it_is_told(tmp_path, clocks, monkeypatch):
     held_ns = []
 
     def told():
-        held_ns.append(virtual_robots[0].now_ns())
+        held_ns.append(clocks[0].monotonic_ns())
         return len(held_ns) > 25  # half a second
 
     monkeypatch.setattr(episode, "_told", told)
@@ -112,7 +129,7 @@ def test_a_robot_that_would_fall_is_held_until_it_is_told(tmp_path, virtual_robo
     assert effects["values"][-1, 0] == OperatingMode.OFF
 
 
-def test_the_delay_is_measured_before_the_policy_moves_the_robot(tmp_path, virtual_robots):
+def test_the_delay_is_measured_before_the_policy_moves_the_robot(tmp_path):
     code, _, folder = deploy(tmp_path, "pendulum", make_bundle("pendulum", tmp_path), "--duration-s", 1)
     assert code == errors.OK
     # The emulated robot's round trip takes 45 ms on average.
@@ -124,7 +141,7 @@ def test_the_delay_is_measured_before_the_policy_moves_the_robot(tmp_path, virtu
     assert_torque_ends_off(read_truth(folder / "truth.bin"))
 
 
-def test_what_this_robot_cannot_do_is_refused(tmp_path, virtual_robots):
+def test_what_this_robot_cannot_do_is_refused(tmp_path):
     bundle = make_bundle("pendulum", tmp_path)
     flags = ["--bundle", str(bundle), "--max-tilt-rad", "1", "--runs", str(tmp_path)]
     assert cli.main(["deploy", "pendulum", *flags]) == errors.USAGE
@@ -134,7 +151,7 @@ def test_what_this_robot_cannot_do_is_refused(tmp_path, virtual_robots):
     assert manifest_of(folder)["status"] == "failed"
 
 
-def test_a_recording_knows_the_shares_of_host_and_bus_in_the_delay(tmp_path, virtual_robots):
+def test_a_recording_knows_the_shares_of_host_and_bus_in_the_delay(tmp_path):
     _, _, folder = call(tmp_path, "record", "pendulum", "--duration-s", 2)
     parts = {name: (where, counted) for name, where, _, counted in parts_of(Recording.load(folder / "session.mcap"))}
     assert parts["sensor on the bus, question and answer"] == ("bus", False)
@@ -142,7 +159,7 @@ def test_a_recording_knows_the_shares_of_host_and_bus_in_the_delay(tmp_path, vir
     assert {where for where, _ in parts.values()} == {"host", "bus"}
 
 
-def test_a_recording_by_hand_has_no_command_and_no_torque(tmp_path, virtual_robots):
+def test_a_recording_by_hand_has_no_command_and_no_torque(tmp_path):
     robot = load_robot("so101")
     embedded = robot.drive.embedded
     start, t_s = np.array(load_module(robot.name, "plant").SO101Plant().data.qpos), np.arange(0.0, 4.0, 1 / 30)

@@ -29,7 +29,7 @@ def record(root, view, *, duration_s=2.0, pipeline="pendulum"):
 
 @pytest.mark.night
 @pytest.mark.parametrize("pipeline", ["pendulum", "so101"])
-def test_the_viewer_gets_every_signal_lateness_and_the_robot(tmp_path, pipeline, virtual_robots):
+def test_the_viewer_gets_every_signal_lateness_and_the_robot(tmp_path, pipeline):
     pytest.importorskip("rerun")
     from rerun.chunk import RrdReader
 
@@ -50,7 +50,7 @@ def test_the_viewer_gets_every_signal_lateness_and_the_robot(tmp_path, pipeline,
 
 
 @pytest.mark.night  # it waits for the viewer
-def test_a_viewer_that_reads_nothing_costs_no_row(tmp_path, capsys, virtual_robots):
+def test_a_viewer_that_reads_nothing_costs_no_row(tmp_path, capsys):
     with socket.socket() as deaf:
         deaf.bind(("127.0.0.1", 0))
         deaf.listen()
@@ -60,7 +60,7 @@ def test_a_viewer_that_reads_nothing_costs_no_row(tmp_path, capsys, virtual_robo
 
 
 @pytest.mark.night  # the viewer is a process
-def test_without_a_screen_the_recording_goes_on_and_names_another_viewer(tmp_path, capsys, monkeypatch, virtual_robots):
+def test_without_a_screen_the_recording_goes_on_and_names_another_viewer(tmp_path, capsys, monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     record(tmp_path / "runs", ["--view"], duration_s=1.0)

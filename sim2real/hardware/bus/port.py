@@ -205,7 +205,7 @@ def _confirms(port: Line, query: bytes, answers: Sequence[bytes], answer_s: floa
 
 
 EMULATED: Final[dict[str, Callable[[int], Port]]] = {}
-"""Address -> opens, at a baud rate, the port of an emulated robot in this process: `emulation.virtual`."""
+"""Address -> opens, at a baud rate, the port of an emulated robot in this process: `emulation`."""
 
 
 def open_port(address: str, baud_rate: int) -> Port:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from sim2real.errors import UsageError
@@ -13,8 +13,6 @@ if TYPE_CHECKING:
 
 GateLimit: TypeAlias = float | tuple[float | Sequence[float], float | Sequence[float]]
 
-EMBEDDED = "embedded"
-"""The port of a robot's emulated twin."""
 POSITIVE = (
     "command_timeout_s",
     "max_speed_rad_s",
@@ -25,8 +23,6 @@ POSITIVE = (
     "stop_s",
 )
 """Limits that must be above 0."""
-_PATIENCE_S = 2.0
-"""Longest silence and oldest measurement of an emulated robot [s]."""
 
 
 @dataclass(frozen=True)
@@ -66,13 +62,6 @@ class GateLimits:
             raise UsageError(f"gate.servo_watchdog_s must lie in [0.02, 2.54] s, got {self.servo_watchdog_s}")
         if self.envelope_rad is not None and not self.envelope_rad[0] < self.envelope_rad[1]:
             raise UsageError(f"gate.envelope_rad must be the lowest and the highest angle, got {self.envelope_rad}")
-
-    def on(self, port: str) -> GateLimits:
-        """Return the limits for a port: an emulated robot waits for its host, which may be busy."""
-        if port != EMBEDDED:
-            return self
-        age_s, silence_s = max(_PATIENCE_S, self.max_sample_age_s), max(_PATIENCE_S, self.servo_watchdog_s)
-        return replace(self, max_sample_age_s=age_s, servo_watchdog_s=silence_s)
 
     def gate(self, limit: GateLimit, **settings: Any) -> GateConfig:
         """Return the gate of a robot with these limits.

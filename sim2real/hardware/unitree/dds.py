@@ -285,7 +285,7 @@ class StateStream:
 
 
 EMULATED: Final[dict[Address, Callable[[str], DdsLink]]] = {}
-"""Address -> connects, with a mark, to an emulated robot in this process: `emulation.virtual`."""
+"""Address -> connects, with a mark, to an emulated robot in this process: `emulation`."""
 
 
 def connect(address: Address, mark: str) -> DdsLink:

@@ -17,7 +17,7 @@ from sim2real.errors import ERROR, OK, DeadlineExceeded, SafetyStop, Sim2RealErr
 from sim2real.graph.base import GraphState
 from sim2real.graph.episode import MessageRecord, Recorder, StepRecord, named_leaves
 from sim2real.graph.node import BaseNode
-from sim2real.hardware.clock import Clock
+from sim2real.hardware.clock import SYSTEM_CLOCK, Clock
 from sim2real.hardware.safety.rig import Rig
 from sim2real.installation import has_jax
 from sim2real.later import jax
@@ -26,8 +26,9 @@ from sim2real.robots.loop import ACTUATOR, AGENT, ROLES, SENSOR
 from sim2real.robots.robot import Robot
 from sim2real.robots.session import Session
 from sim2real.runtime.asynchronous import AsyncGraph
-from sim2real.runtime.clock import realtime
+from sim2real.runtime.clock import MonotonicClock, realtime
 from sim2real.runtime.failure import noted
+from sim2real.runtime.virtual import VirtualClock
 from sim2real.stages.deploy.config import DeployConfig
 from sim2real.stages.session.config import RecordConfig
 from sim2real.stages.terminal.console import note, progress, table
@@ -95,8 +96,7 @@ def opened(robot: Robot, config: RecordConfig | DeployConfig, truth_path: Path) 
     if config.dry_run:
         note("dry run: torque stays off and no goal is sent; what would have been sent is logged")
     hanging = isinstance(config, RecordConfig) and not config.standing
-    limits = config.gate.on(config.port)
-    with robot.drive.connect(config.port, limits, truth_path, config.seed, hanging) as session, realtime():
+    with robot.drive.connect(config.port, config.gate, truth_path, config.seed, hanging) as session, realtime():
         # Sessions come from plug-ins too: refuse what has no safety gate, no guardian and no dry run.
         if not isinstance(session.rig, Rig):
             raise UsageError(
@@ -105,8 +105,8 @@ def opened(robot: Robot, config: RecordConfig | DeployConfig, truth_path: Path) 
             )
         if config.dry_run:
             session.rig.withhold_torque()
-        for line in session.rig.device.without_host():
-            note(f"if this process dies: {line}; the guardian takes the torque off", config.port != "embedded")
+        for line in session.rig.device.without_host() if config.port != "embedded" else ():
+            note(f"if this process dies: {line}; the guardian takes the torque off", urgent=True)
         yield Bench(robot, session, config)
 
 
@@ -139,7 +139,8 @@ class Bench:
         """
         hold = getattr(self.config, "hold", False)
         # Without an agent, as in a recording by hand, the sensor is the only node.
-        graph = AsyncGraph(nodes, nodes.get(AGENT) or nodes[SENSOR])
+        clock = MonotonicClock() if self.rig.clock is SYSTEM_CLOCK else VirtualClock(self.rig.clock)
+        graph = AsyncGraph(nodes, nodes.get(AGENT) or nodes[SENSOR], clock)
         state = graph.init(jax.random.key(0) if has_jax() else None, params)
         graph.warmup(state)  # every program is compiled before torque goes on
         # Start the log, and run; an interrupted episode comes to rest before torque goes off.
@@ -333,7 +334,7 @@ def timing_rows(summary: Mapping[str, Any]) -> tuple[list[list[Any]], list[str]]
     return rows, [*headers, "overruns"]
 
 
-def show_sessions(summaries: Sequence[Mapping[str, Any]], dry_run: bool, embedded: bool) -> None:
+def show_sessions(summaries: Sequence[Mapping[str, Any]], dry_run: bool) -> None:
     """Print the timing of the last session and the warnings of all; of a dry run the withheld commands, too."""
     print(table(*timing_rows(summaries[-1])))
     for summary in summaries:
@@ -341,8 +342,7 @@ def show_sessions(summaries: Sequence[Mapping[str, Any]], dry_run: bool, embedde
         if share > LATE_SHARE:
             note(
                 f"warning: {share:.1%} of the answers came late: when those samples were taken is not sure\n"
-                "hint: close what else runs on this computer"
-                + ("" if embedded else ", and set the latency timer of a USB adapter to 1 ms")
+                "hint: close what else runs on this computer, and set the latency timer of a USB adapter to 1 ms"
             )
     if not dry_run:
         return

@@ -11,8 +11,7 @@ pytest.importorskip("cyclonedds")
 from unitree_bench import CONTROLS, DAMPS, OFF, ways
 
 from pipelines.go2.plant import LYING, Go2Body
-from sim2real.emulation.legs import UnitreeEmulation
-from sim2real.emulation.virtual_legs import VirtualLegs
+from sim2real.emulation.legs import UnitreeEmulation, VirtualLegs
 from sim2real.errors import HardwareLost, SafetyStop, UsageError
 from sim2real.hardware.device import Alone
 from sim2real.hardware.registry import load_device
@@ -27,7 +26,7 @@ MIXED = (3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8)
 @pytest.fixture
 def robot(tmp_path, request):
     body = Go2Body(getattr(request, "param", "floor"))
-    served = VirtualLegs(body, UnitreeEmulation(alone_after_s=None), tmp_path / "truth.bin")
+    served = VirtualLegs(body, UnitreeEmulation(alone_after_s=None), None, tmp_path / "truth.bin")
     yield served
     served.stop()
 
