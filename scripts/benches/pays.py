@@ -276,7 +276,9 @@ def train_config(robot: Any, task: str, way: str, seed: int, options: argparse.N
         force=True,
         sensitivity=False,
         vary=replace(usual.vary, **vary),
-        ppo=replace(usual.ppo, total_steps=options.steps or case.steps[task], num_envs=options.envs, **{**case.ppo, **few}),
+        ppo=replace(
+            usual.ppo, total_steps=options.steps or case.steps[task], num_envs=options.envs, **{**case.ppo, **few}
+        ),
     )
 
 
