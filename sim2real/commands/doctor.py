@@ -73,8 +73,8 @@ def _answer(config: DoctorConfig) -> tuple[dict[str, Any], list[str], bool]:
         with progress(None, "let the policy act in the model"):
             data = examine(policy, drives)
         return data, [data["sentence"], *(f"- {line}" for line in data["lines"])], not data["sound"]
-    log = read_deployment(config.log, wanted, joints)
-    sim = None if config.sim is None else read_deployment(config.sim, wanted, joints)
+    log = read_deployment(config.log, wanted, joints, policy.contract.drive)
+    sim = None if config.sim is None else read_deployment(config.sim, wanted, joints, policy.contract.drive)
     note(f"{len(log.t)} steps of the policy in {log.t[-1] - log.t[0]:.1f} s")
     with progress(None, "look for what is wrong"):
         found = diagnose(policy, log, drives, sim, joints)

@@ -4,34 +4,30 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 from sim2real.errors import UsageError
-from sim2real.log.importing.names import columns_of
+from sim2real.log.importing import bags
+from sim2real.log.importing.mapping import in_si
+from sim2real.log.importing.names import Signal, columns_of, meaning
+from sim2real.log.importing.propose import ImportHints, Proposal
+from sim2real.log.importing.readers import Table, open_tables
 
-_NAMES = {
-    "t": "t time time_s stamp timestamp t_s",
-    "q": "q th theta position positions joint_pos joint_position dof_pos qpos",
-    "dq": "dq thdot qd velocity velocities joint_vel joint_velocity dof_vel qvel",
+_VECTORS = {
     "quat": "quat quaternion orientation base_quat imu_quat",
     "gyro": "gyro ang_vel angular_velocity base_ang_vel imu_gyro",
     "lin_vel": "lin_vel base_lin_vel linear_velocity",
-    "command": "command cmd velocity_command velocity_commands aim",
+    "command": "command cmd cmd_vel velocity_command velocity_commands aim",
     "obs": "observation obs observations",
     "action": "action actions raw_action network_action",
-    "target": "target targets goal goals q_des q_target goal_position cmd_position joint_target torque_command",
-    "torque": "torque tau tau_est effort",
-    "state_t": "state_t state_time sensor_time",
 }
-"""Signal -> its names in a file, whose last part counts: ``sensor.position``."""
-_OF_NAME = {name: signal for signal, names in _NAMES.items() for name in names.split()}
-_STATES = ("q", "dq", "quat", "gyro", "lin_vel")
-_OF_STEPS = ("command", "obs", "action", "target")
-_UNUSED_NODES = ("world", "truth")
+"""Signal without joints -> its names in a file; those of joints have the meanings of an import."""
+_OF_NAME = {name: signal for signal, names in _VECTORS.items() for name in names.split()}
+_ENTRIES = ["w", "x", "y", "z", "linear.x", "linear.y", "angular.z"]
 
 
 @dataclass(frozen=True)
@@ -73,11 +69,7 @@ class Log:
         """Ages of the measurements that the steps answer [s]: by the messages, or of the newest ones."""
         if self.message_age_s is not None or self.rows_are_steps:
             return self.message_age_s
-        return self.t - self.state_t[self._rows(0.0)]
-
-    def _rows(self, lag_s: float) -> np.ndarray:
-        rows = np.searchsorted(self.state_t, self.t - lag_s + 1e-6, side="right") - 1
-        return np.clip(rows, 0, len(self.state_t) - 1)
+        return self.t - self.state_t[newest(self.state_t, self.t)]
 
     def at_steps(self, name: str, lag_s: float = 0.0) -> np.ndarray:
         """Return a measured signal at the policy's steps, ``lag_s`` earlier; between measurements the older counts."""
@@ -87,153 +79,158 @@ class Log:
             low = np.clip(np.floor(rows + 1e-6).astype(int), 0, len(values) - 1)
             high, share = np.minimum(low + 1, len(values) - 1), np.clip(rows - low, 0.0, 1.0)[:, None]
             return values[low] if not np.any(share > 1e-6) else (1 - share) * values[low] + share * values[high]
-        return values[self._rows(lag_s)]
+        return values[newest(self.state_t, self.t - lag_s)]
 
 
-@dataclass(frozen=True)
-class _Signal:
-    """Rows ``(K, C)``, their times (none: those of the steps), and the names of the columns."""
-
-    values: np.ndarray
-    t: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    columns: Sequence[str] = ()
+def newest(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Return the row that is newest at each of some times."""
+    return np.clip(np.searchsorted(times, wanted + 1e-6, side="right") - 1, 0, len(times) - 1)
 
 
-def read_deployment(path: Path, joints: Sequence[str], robot_joints: Sequence[str] = ()) -> Log:
-    """Read a log of this project, or a CSV, NPZ, JSON or bag with a row for each step of the policy.
+def read_deployment(
+    path: Path, joints: Sequence[str], robot_joints: Sequence[str] = (), drive: str = "position"
+) -> Log:
+    """Read a log of this project, or a CSV, NPZ, JSON or bag.
 
     Args:
         joints: The joints of the contract, which are sought in the names of the columns.
         robot_joints: The joints in the order of columns without names; default: the contract's.
+        drive: The contract's: whether targets are angles or torques.
 
     Raises:
-        UsageError: The file cannot be read, or has no times, positions or commands.
+        UsageError: The file cannot be read, has no times, positions or commands, or names that fit no joint.
     """
-    signals, age_s = _signals(path)
-    found: dict[str, _Signal] = {}
+    table, age_s = _own_table(path) if path.is_file() and bags.is_ours(path) else (open_tables(path)[0], None)
+    vectors = _take_vectors(table, joints)
+    reader = Proposal(table, ImportHints(""))
+    signals = {**_of_joints(reader.signals, joints, robot_joints or joints, drive), **vectors}
+    listed = ", ".join([*vectors, *table.keys]) or "nothing"
+    if "q" not in signals or not {"action", "target"} & set(signals):
+        what = "positions q" if "q" not in signals else "actions and no targets"
+        raise UsageError(f"{path} has no {what}. It has {listed}", hint="the guide 'Doctor' lists the signals")
+    times: dict[str, np.ndarray] = {}
     for name, signal in signals.items():
-        if (kind := _kind_of(name)) is not None and kind not in found:
-            found[kind] = _in_order(signal, robot_joints, joints, name) if kind in ("q", "dq", "target") else signal
-    stamps = [found[n].t for n in ("action", "obs", "target") if n in found and len(found[n].t)]
-    step_t = found["t"].values if "t" in found else stamps[0] if stamps else None
-    if missing := [n for n, lacks in (("times t", step_t is None), ("positions q", "q" not in found)) if lacks]:
-        raise UsageError(
-            f"{path} has no {' and no '.join(missing)}. It has {', '.join(signals) or 'nothing'}",
-            hint="the guide 'Doctor' lists the signals and their names",
-        )
-    assert step_t is not None
-    if "action" not in found and "target" not in found:
-        raise UsageError(f"{path} has neither actions nor targets, so nothing of the policy")
-    if len(step_t) < 20 or not any(len(found[n].values) == len(step_t) for n in _OF_STEPS[1:] if n in found):
-        raise UsageError(f"{path} has {len(step_t)} times of steps; actions, targets or observations do not fit them")
-    q = found["q"]
-    state_t = found["state_t"].values if "state_t" in found else q.t if len(q.t) == len(q.values) else step_t
-    if "dq" not in found:
-        found["dq"] = _Signal(np.gradient(q.values, state_t, axis=0), state_t)
-    order = np.argsort(state_t, kind="stable")
-    parts: dict[str, np.ndarray] = {}
-    for name, signal in found.items():
+        rows = len(signal.values)
         if not np.isfinite(signal.values).all():
             raise UsageError(f"{path}: {name} has values that are not finite")
-        if name in _STATES:
-            parts[name] = _at(signal, state_t, f"{path}: {name}")[order]
-        elif name in _OF_STEPS:
-            parts[name] = _at(signal, step_t, f"{path}: {name}")
+        if rows == 1:  # holds for all
+            continue
+        reader.questions.clear()
+        node = "actuator" if name in ("command", "obs", "action", "target") else "sensor"
+        times[name] = reader.clock(replace(signal, meaning=replace(signal.meaning, side="")), node)[1]
+        if reader.questions:
+            raise UsageError(
+                f"{path}: {name} has {rows} rows; their times: {'; '.join(reader.questions.values())}",
+                hint=f"give it the rows of the times t, or times of its own; the file has {listed}",
+            )
+    step_t, state_t = next(times[n] for n in ("action", "obs", "target") if n in times), times["q"]
+    if len(step_t) < 20:
+        raise UsageError(f"{path} has {len(step_t)} steps of the policy, too few")
+    if min(step_t[-1], state_t[-1]) - max(step_t[0], state_t[0]) < 0.5 * min(np.ptp(step_t), np.ptp(state_t)):
+        raise UsageError(f"{path}: the times of positions and commands hardly overlap: they have two clocks")
+    start, parts = min(step_t[0], state_t[0]), dict[str, np.ndarray]()
+    for name, signal in signals.items():
+        wanted = state_t if name in ("q", "dq", "quat", "gyro", "lin_vel") else step_t
+        own = times.get(name, wanted[:1])
+        rows = newest(own, wanted)
+        if name == "target":  # it leaves after its step
+            rows = np.minimum(np.searchsorted(own, wanted - 1e-6), len(own) - 1)
+        parts[name] = signal.values[rows]
+    if "dq" not in parts:
+        parts["dq"] = np.gradient(parts["q"], state_t, axis=0)
     if "action" in parts and parts["action"].shape[1] != len(joints):
         raise UsageError(f"{path}: action has {parts['action'].shape[1]} columns, the policy {len(joints)}")
-    return Log(step_t, state_t[order], message_age_s=age_s, **parts)
+    return Log(step_t - start, state_t - start, message_age_s=age_s, **parts)
 
 
-def _at(signal: _Signal, wanted: np.ndarray, what: str) -> np.ndarray:
-    """Return a signal at other times: the newest value then; a single row holds for all.
-
-    Raises:
-        UsageError: It has another number of rows, and no times of its own.
-    """
-    values, times = signal.values, signal.t
-    if len(values) == len(wanted):
-        return values
-    if len(values) == 1:
-        return np.repeat(values, len(wanted), axis=0)
-    if len(times) != len(values):
-        raise UsageError(f"{what} has {len(values)} rows and no times of its own; {len(wanted)} rows are wanted")
-    return values[np.clip(np.searchsorted(times, wanted + 1e-6, side="right") - 1, 0, len(values) - 1)]
+def _vector(name: str) -> tuple[str, str]:
+    """Return what a column is without joints, and which entry: ``observation[3]``, ``/imu.orientation.x``."""
+    ends = [(len(name), "")] + [(m.start(), name[m.end() :].rstrip("]")) for m in re.finditer(r"[.\[/_]", name)]
+    for end, entry in ends:
+        parts = [part for part in re.split(r"[./]", name[:end].lower()) if part not in ("data", "values")]
+        kind, usual = _OF_NAME.get(parts[-1] if parts else "", ""), not entry or entry.isdigit() or entry in _ENTRIES
+        if kind and (usual or entry == "data" or (kind in ("obs", "action") and name[end] != "_")):
+            return kind, entry
+    return "", ""
 
 
-def _kind_of(name: str) -> str | None:
-    """Return the kind of a signal; an angle or a torque of a command is a target, a measured torque is not used."""
-    *nodes, last = re.split(r"[./]", name.lower())
-    if nodes[:1] and nodes[0] in _UNUSED_NODES:
-        return None
-    kind = _OF_NAME.get(last)
-    if nodes[:1] == ["agent"]:
-        return kind if kind in ("action", "obs", "command") else None
-    if any(node == "actuator" or node.endswith("cmd") for node in nodes):
-        return "target" if kind in ("q", "target", "action", "torque") else None
-    return None if kind == "torque" else kind
+def _take_vectors(table: Table, joints: Sequence[str]) -> dict[str, Signal]:
+    """Return the signals without joints, and take their columns out of the table."""
+    columns: dict[str, dict[str, str]] = {}
+    for name in list(table.columns):
+        kind, entry = _vector(name)
+        if kind and np.ndim(table.columns[name]) in (1, 2) and entry not in columns.get(kind, {}):
+            columns.setdefault(kind, {})[entry] = name
+    found = {}
+    for kind, named in columns.items():
+        entries = [""] if "" in named else list(named)
+        if all(e.isdigit() or e in _ENTRIES for e in entries):
+            entries.sort(key=lambda e: _ENTRIES.index(e) if e in _ENTRIES else int(e))
+        elif kind == "action" and (order := columns_of(joints, [meaning(e).label for e in entries])):
+            entries = [entries[i] for i in order[0]]
+        taken = [table.columns[named[e]].astype(float) for e in entries]
+        values = np.concatenate([v if v.ndim == 2 else v[:, None] for v in taken], axis=1)
+        names = tuple(named[e] for e in entries)
+        unit = meaning(names[0])
+        found[kind] = Signal(names, ("",) * values.shape[1], unit, values * in_si(unit.unit)[0])
+        for name in named.values():
+            del table.columns[name]
+    return found
 
 
-def _in_order(signal: _Signal, robot_joints: Sequence[str], joints: Sequence[str], name: str) -> _Signal:
-    """Return the columns of the joints in the contract's order; without names they come in the robot's order."""
-    names = signal.columns or robot_joints
-    if not names:
-        if signal.values.ndim != 2 or signal.values.shape[1] != len(joints):
-            raise UsageError(
-                f"{name} has {signal.values.shape[1:]} columns without names, the contract {len(joints)} joints",
-                hint="name the columns, such as q.FL_hip_joint",
-            )
-        return signal
-    exact = [names.index(j) for j in joints if j in names]
-    found = (exact, "") if len(exact) == len(joints) else columns_of(joints, names)
-    if found is None:
-        raise UsageError(f"{name} has the columns {', '.join(names)}; the contract's joints: {', '.join(joints)}")
-    return replace(signal, values=signal.values[:, found[0]])
+def _of_joints(signals: Sequence[Signal], joints: Sequence[str], robot: Sequence[str], drive: str) -> dict[str, Signal]:
+    """Return positions, velocities and targets in the contract's order; columns without names come in the robot's."""
+    quantities = {"q": ("position",), "dq": ("velocity",), "target": ("position", "", "torque")}
+    if drive == "torque":
+        quantities["target"] = ("torque", "position", "")
+    found: dict[str, Signal] = {}
+    for kind, wanted in quantities.items():
+        own = [s for quantity in wanted for s in signals if s.meaning.quantity == quantity and s.values.ndim == 2
+               and (s.meaning.side == "command") == (kind == "target")]  # fmt: skip
+        for s in own:
+            numbered = {re.sub(r"_?\d+$", "", label) for label in s.labels}
+            if any(s.labels) and (len(numbered) > 1 or s.width == 1 < len(joints)):
+                places = columns_of(joints, s.labels)
+            else:
+                by_name = {name: i for i, name in enumerate(robot)}
+                places = s.width == len(robot) and ([by_name[j] for j in joints], "")
+            if places:
+                factor, unit = in_si(s.meaning.unit)
+                if unit not in ("", "rad", "m", "s"):
+                    raise UsageError(f"{s.name} is in {s.meaning.unit}: the doctor reads radians, degrees and metres")
+                found[kind] = replace(s.taken(places[0]), values=s.values[:, places[0]] * factor)
+                break
+        else:
+            if wide := [s for s in own if s.width > 1 or len(joints) == 1]:
+                named = ", ".join(filter(None, wide[0].labels)) or "without names"
+                raise UsageError(
+                    f"{wide[0].name} has {wide[0].width} columns, {named}; the contract's joints: {', '.join(joints)}",
+                    hint=f"name the columns, such as q.{joints[0]}",
+                )
+    return found
 
 
-def _signals(path: Path) -> tuple[dict[str, _Signal], np.ndarray | None]:
-    """Return the signals of a file by their names, and the ages of observations."""
-    from sim2real.log.importing.readers import open_tables
-    from sim2real.log.writer import LIBRARY
-
-    if path.is_file():
-        with path.open("rb") as file:
-            if LIBRARY.split()[0].encode() in file.read(200):
-                return _own_log(path)
-    table = open_tables(path)[0]
-    of_file = next((list(words) for name, words in table.words.items() if name in ("joints", "joint_names")), [])
-    signals: dict[str, _Signal] = {}
-    joined: dict[str, list[tuple[str, np.ndarray]]] = {}
-    for name, values in table.columns.items():
-        # One column for each joint, or each entry: `q.FL_hip_joint`, `observation[3]`, `action_0`.
-        match = re.fullmatch(r"(.+?)[.\[/](.+?)\]?", name) or re.fullmatch(r"(.+?)_(\d+)", name)
-        if np.ndim(values) == 1 and match and _OF_NAME.get(match[1].lower()):
-            joined.setdefault(match[1], []).append((match[2], values))
-        elif np.ndim(values) == 2 or _OF_NAME.get(name.lower()) in ("t", "state_t"):
-            signals[name] = _Signal(np.asarray(values, float), columns=of_file or table.names.get(name, []))
-    for name, columns in joined.items():
-        labels = [label for label, _ in columns]
-        numbered = all(re.fullmatch(r"\d+", label) for label in labels)
-        values = np.stack([np.asarray(v, float) for _, v in columns], axis=1)
-        signals[name] = _Signal(values, columns=of_file or ([] if numbered else labels))
-    return signals, None
-
-
-def _own_log(path: Path) -> tuple[dict[str, _Signal], np.ndarray | None]:
+def _own_table(path: Path) -> tuple[Table, np.ndarray | None]:
+    """Return the outputs of a log of this project as a table, and the ages of the agent's observations."""
     from sim2real.log.reader import read_log
 
-    episode = read_log(path)
-    signals, age_s = {}, None
-    joints = episode.metadata.get("joints", [])
+    episode, age_s = read_log(path), None
+    table, joints = Table(path, "sim2real"), episode.metadata.get("joints", [])
     for node, output in episode.outputs.items():
-        steps = episode.steps[node]
-        for name, field_values in ((f"{node}.{leaf}", v) for leaf, v in output.items()):
+        if node in ("world", "truth"):
+            continue
+        agent, commands = node == "agent", node in ("agent", "actuator")
+        topic, steps = f"/{node}_cmd" if node == "actuator" else f"/{node}", episode.steps[node]
+        table.add(f"{topic}.stamp_us", steps.end if commands else np.rint(1e6 * steps.begun_s).astype(np.int64))
+        for leaf, field_values in output.items():
             values = np.asarray(field_values, float)
-            values = values if values.ndim > 1 else values[:, None]
-            times = steps.begun_s if _kind_of(name) in _STATES else steps.end / 1e6
-            signals[name] = _Signal(values, times, joints if values.shape[1] == len(joints) else ())
+            if values.ndim < 3 and not (agent and _vector(leaf)[0] not in ("action", "obs", "command")):
+                table.add(f"{topic}.{leaf}", values if values.ndim > 1 else values[:, None])
+                if values.shape[1:] == (len(joints),):
+                    table.names[f"{topic}.{leaf}"] = list(joints)
     for (node, source), messages in episode.messages.items():
         if source == "sensor" and node in ("agent", "policy") and len(messages):
             begun, ended = episode.steps[node].begun_s, episode.steps[source].begun_s
             ok = (messages.seq_in >= 0) & (messages.seq_in < len(begun)) & (messages.seq_out < len(ended))
             age_s = begun[messages.seq_in[ok]] - ended[messages.seq_out[ok]]
-    return signals, age_s
+    return table, age_s
