@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from sim2real.doctor.contract import UNMEASURED, Policy
+from sim2real.doctor.deployed import Deployed, Making
 from sim2real.doctor.log import Log
 from sim2real.doctor.plant import Drives, Plant, lowest_points, mujoco
-from sim2real.doctor.solve import Deployed, Making
 
 _SECONDS, _DELAYS_S = 4.0, (0.0, 0.005, 0.01, 0.02, 0.03, 0.04)
 _PLANTS = {"0.7 of the gains": Plant(kp=0.7, kd=0.7), "1.3 of the gains": Plant(kp=1.3, kd=1.3),

@@ -11,7 +11,8 @@ import numpy as np
 from sim2real.doctor.contract import Contract, Policy
 from sim2real.doctor.log import Log
 from sim2real.doctor.plant import Drives, solve_plant
-from sim2real.doctor.solve import Finding, solve_contract
+from sim2real.doctor.search import Finding
+from sim2real.doctor.solve import solve_contract
 from sim2real.errors import UsageError
 
 _UNEXPLAINED = 0.45

@@ -14,8 +14,9 @@ import mujoco as mujoco_c
 import numpy as np
 
 from sim2real.doctor.contract import Contract
+from sim2real.doctor.deployed import known, matrices
 from sim2real.doctor.log import Log
-from sim2real.doctor.solve import Finding, known, matrices, shortened
+from sim2real.doctor.search import Finding, shortened
 from sim2real.errors import UsageError
 
 _STEP_S, _WINDOW_S, _WINDOWS = 0.0025, 0.2, 40

@@ -14,7 +14,7 @@ from sim2real.doctor.contract import Contract, Term, contract_toml
 from sim2real.doctor.diagnosis import solve_timing
 from sim2real.doctor.log import read_deployment
 from sim2real.doctor.plant import Drives, driven_joints, solve_plant
-from sim2real.doctor.solve import shortened
+from sim2real.doctor.search import shortened
 
 XML = """<mujoco><option timestep="0.0025"/><worldbody><body>
 <joint name="a" axis="0 1 0" damping="0.01" armature="0.003"/>
