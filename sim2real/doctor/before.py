@@ -14,8 +14,9 @@ from sim2real.doctor.log import Log
 from sim2real.doctor.plant import Drives, Plant, lowest_points, mujoco
 
 _SECONDS, _DELAYS_S = 4.0, (0.0, 0.005, 0.01, 0.02, 0.03, 0.04)
-_PLANTS = {"0.7 of the gains": Plant(kp=0.7, kd=0.7), "1.3 of the gains": Plant(kp=1.3, kd=1.3),
-           "half of the friction": Plant(friction=0.5), "twice the friction": Plant(friction=2.0)}  # fmt: skip
+_PLANTS = {"0.7 of the gains": Plant((("kd", 0.7), ("kp", 0.7))), "1.3 of the gains": Plant((("kd", 1.3), ("kp", 1.3))),
+           "no dry friction": Plant((("friction", -1.0),)),
+           "dry friction of 5% of the largest torque": Plant((("friction", 0.05),))}  # fmt: skip
 _STARTS, _POSE_RAD, _TILT_RAD = 8, 0.25, 0.15
 _LARGE = (1.0, 10.0, 1000.0)
 _UPRIGHT, _FAST_RAD_S = 0.5, 3.0
@@ -56,7 +57,7 @@ def examine(policy: Policy, drives: Drives) -> dict[str, Any]:
     nominal = _run(policy, drives, Plant())
     stands = lambda plant: (run := _run(policy, drives, plant)).up and run.speed < limit  # noqa: E731
     limit = max(3.0 * nominal.speed, _FAST_RAD_S)
-    delays = {f"{1e3 * delay_s:.0f} ms": stands(Plant(delay_s=delay_s)) for delay_s in _DELAYS_S}
+    delays = {f"{1e3 * delay_s:.0f} ms": stands(Plant().having("delay_s", delay_s)) for delay_s in _DELAYS_S}
     plants = {name: stands(plant) for name, plant in _PLANTS.items()}
     starts = sum(_run(policy, drives, Plant(), np.random.default_rng(seed)).up for seed in range(_STARTS))
     if not nominal.up:
@@ -84,7 +85,7 @@ def examine(policy: Policy, drives: Drives) -> dict[str, Any]:
 def _run(policy: Policy, drives: Drives, plant: Plant, start: np.random.Generator | None = None) -> Run:
     """Let the policy act in the model, with the command 0; ``start`` draws another start."""
     c, d = policy.contract, drives
-    model = d.with_plant(plant, np.full(len(c.joints), 1e6))
+    model = d.with_plant(plant, np.minimum(d.limit, d.kp))  # the largest torque: by the model, or for 1 rad
     data = mujoco.MjData(model)
     default = c.per_joint("default_joint_pos")
     spread = (0.0, 0.0) if start is None else (_POSE_RAD, _TILT_RAD)
@@ -125,7 +126,7 @@ def _run(policy: Policy, drives: Drives, plant: Plant, start: np.random.Generato
             if not np.isfinite(action).all():
                 return Run(False, now, np.inf, 1.0, 1.0)
             target = deployed.targets(Making(), action[None])[0]
-            commands.append((now + plant.delay_s, target))
+            commands.append((now + plant.number("delay_s", 0.0), target))
             clipped.append(np.abs(d.torque(target, q[-1], dq[-1])) > d.limit)
             beyond.append(bounded & ((target < low) | (target > high)))
         while len(commands) > 1 and commands[1][0] <= now:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +16,7 @@ import numpy as np
 from sim2real.doctor.contract import Contract
 from sim2real.doctor.deployed import known, matrices
 from sim2real.doctor.log import Log
-from sim2real.doctor.search import Finding, shortened
+from sim2real.doctor.search import Candidate, Dial, Finding, Setting, explain, shortened
 from sim2real.errors import UsageError
 
 _STEP_S, _WINDOW_S, _WINDOWS = 0.0025, 0.2, 40
@@ -27,36 +27,61 @@ _LOWER = 0.75
 """A torque limit is a fault if it is below this share of the model's: drives that lag look limited a little earlier."""
 _UPRIGHT = 0.8
 """Cosine of the tilt up to which a free robot stands."""
+_LEAST = 0.08
+"""Share of the replay's error by which a change of the plant must lower it."""
+mujoco: Any = mujoco_c  # its C module has no stubs
 
 
 @dataclass(frozen=True)
-class Plant:
+class Plant(Setting):
     """How drives and bodies differ from the model.
 
-    Attributes:
-        delay_s: From a target in the log to the motion in the log [s].
-        kp, kd, friction: Factors beside the contract's gains and the model.
-        limits: Torque limit of each joint, a share of the largest torque that its targets ask for; empty: the model's.
-        payload: Added mass of the heaviest body, as a share of the robot's.
+    Its numbers: ``delay_s`` from a target in the log to the motion in the log [s]; ``kp``, ``kd``: factors beside the
+    contract's gains; ``friction``: dry friction beside the model's, a share of the largest torques that are asked for;
+    ``armature``: inertia beside the model's, a share of it; ``payload``: mass of the loaded body beside the model's,
+    a share of the robot's. Of one joint: ``kp JOINT``, and ``limit JOINT``, a share of its largest torque.
     """
 
-    delay_s: float = 0.0
-    kp: float = 1.0
-    kd: float = 1.0
-    limits: tuple[float, ...] = ()
-    friction: float = 1.0
-    payload: float = 0.0
+
+@dataclass(frozen=True)
+class _Part:
+    """A number of the plant: what the model says, when it is a fault, and how clearly the replay must speak for it."""
+
+    dial: Dial
+    usual: float
+    is_off: Callable[[float], bool]
+    clear: float
 
 
-mujoco: Any = mujoco_c  # its C module has no stubs
-GRIDS: dict[str, tuple[float, ...]] = {
-    "delay_s": (0.0, 0.007, 0.014, 0.021, 0.028, 0.035, 0.045, 0.06),
-    "kp": (0.35, 0.5, 0.65, 0.8, 1.25, 1.6, 2.2),
-    "friction": (0.2, 3.0, 6.0, 12.0),
-    "payload": (-0.1, 0.1, 0.2, 0.4),
-    "limits": (0.05, 0.08, 0.12, 0.17, 0.24, 0.33, 0.45, 0.6),
-}
-_NOMINAL = Plant()
+_FACTORS = np.array((0.85, 0.93, 1.07, 1.17))
+_PARTS = {
+    "kp": _Part(Dial("gain", "the drives are {value:.2f} times as stiff as the contract says",
+                     (0.35, 0.5, 0.65, 0.8, 1.25, 1.6, 2.2), lambda f: f * _FACTORS),
+                1.0, lambda f: not 0.72 <= f <= 1.4, 1.08),
+    "friction": _Part(Dial("friction", "the joints have more dry friction than the model: {value:.0%} of their largest "
+                           "torque", (-0.1, 0.05, 0.1, 0.2, 0.4), lambda f: f + np.array((-0.03, -0.01, 0.01, 0.03))),
+                      0.0, lambda share: share > 0.08, 1.25),
+    "armature": _Part(Dial("armature", "the joints have {value:+.0%} of their inertia beside the model's",
+                           (-0.4, 0.5, 1.0, 2.0, 4.0), lambda f: f + np.array((-0.3, -0.1, 0.1, 0.3))),
+                      0.0, lambda share: abs(share) > 0.45, 1.25),
+    "payload": _Part(Dial("payload", "the robot carries {value:+.0%} of its mass beside the model's",
+                          (-0.1, 0.1, 0.2, 0.4), lambda f: f + np.array((-0.05, -0.02, 0.02, 0.05))),
+                     0.0, lambda share: abs(share) > 0.12, 1.25),
+}  # fmt: skip
+_DELAY = Dial("delay", "", (0.0, 0.007, 0.014, 0.021, 0.028, 0.035, 0.045, 0.06),
+              lambda s: np.maximum(0.0, s + np.array((-0.005, -0.0015, 0.0015, 0.005))))  # fmt: skip
+_DAMPING = Dial("", "", (1.0,), lambda f: f * np.array((0.8, 1.25)))
+
+
+def _of_one(joint: str) -> _Part:
+    """Return the gain of one joint."""
+    text = f"{joint} is {{value:.2f}} times as stiff as the contract says"
+    return replace(_PARTS["kp"], dial=replace(_PARTS["kp"].dial, text=text), clear=1.25)
+
+
+_LIMITS = (0.05, 0.08, 0.12, 0.17, 0.24, 0.33, 0.45, 0.6)
+_NUISANCE = (_DELAY.move("delay_s"), _DAMPING.move("kd"))
+"""Delay and damping of drives are estimated with anything else."""
 
 
 def driven_joints(mjcf: Path) -> list[str]:
@@ -93,7 +118,7 @@ class Drives:
         names = [given.joint(i).name for i in range(given.njnt)]
         if missing := [j for j in contract.joints if j not in names]:
             raise UsageError(f"{mjcf} has no joint {', '.join(missing)}", hint=f"it has {', '.join(names)}")
-        ids = [names.index(j) for j in contract.joints]
+        self.joints, ids = contract.joints, [names.index(j) for j in contract.joints]
         own = {int(given.actuator_trnid[i, 0]): i for i in range(given.nu)}
         kp, kd = (contract.per_joint(n) if getattr(contract, n) not in ((), {}) else None for n in ("kp", "kd"))
         if contract.drive == "torque":
@@ -126,6 +151,7 @@ class Drives:
         self.model = spec.compile()
         self.qpos = np.array([self.model.joint(j).qposadr[0] for j in contract.joints])
         self.dof = np.array([self.model.joint(j).dofadr[0] for j in contract.joints])
+        self.inertia = self.model.dof_M0[self.dof]
         self.free = self.model.njnt > 0 and int(self.model.jnt_type[0]) == int(mujoco.mjtJoint.mjJNT_FREE)
         # The body that a payload adds to: the heaviest of a free robot, the outermost of a fixed one.
         moved = self.model.jnt_bodyid[[self.model.joint(j).id for j in contract.joints]]
@@ -138,14 +164,18 @@ class Drives:
     def with_plant(self, plant: Plant, asked: np.ndarray) -> Any:
         """Return a copy of the model with other drives; ``asked``: the largest torques of the targets ``(J,)``."""
         model = copy.copy(self.model)
-        model.actuator_gainprm[:, 0] = self.kp * plant.kp
+        per_joint = lambda name, usual: np.array([plant.number(f"{name} {j}", usual) for j in self.joints])  # noqa: E731
+        kp = self.kp * plant.number("kp") * per_joint("kp", 1.0)
+        model.actuator_gainprm[:, 0] = kp
         if not self.torque_driven:
-            model.actuator_biasprm[:, 1], model.actuator_biasprm[:, 2] = -self.kp * plant.kp, -self.kd * plant.kd
-        limit = np.minimum(self.limit, asked * plant.limits if plant.limits else np.inf)
+            model.actuator_biasprm[:, 1], model.actuator_biasprm[:, 2] = -kp, -self.kd * plant.number("kd")
+        limit = np.minimum(self.limit, asked * per_joint("limit", np.inf))
         model.actuator_forcerange[:, 0], model.actuator_forcerange[:, 1] = -limit, limit
-        model.dof_frictionloss[self.dof] *= plant.friction
-        if plant.payload:
-            model.body_mass[self.loaded] += plant.payload * float(self.model.body_mass.sum())
+        friction = model.dof_frictionloss[self.dof] + plant.number("friction", 0.0) * asked
+        model.dof_frictionloss[self.dof] = np.maximum(0.0, friction)
+        model.dof_armature[self.dof] += np.maximum(-model.dof_armature[self.dof],
+                                                   plant.number("armature", 0.0) * self.inertia)  # fmt: skip
+        model.body_mass[self.loaded] += plant.number("payload", 0.0) * float(self.model.body_mass.sum())
         return model
 
 
@@ -217,92 +247,88 @@ class Replay:
         mujoco.mj_getState(d.model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
         return state
 
-    def residuals(self, plant: Plant) -> np.ndarray:
-        """Return the simulated angles less the measured ones, as a share of the motion ``(W, T, J)``."""
+    def rolled(self, plant: Plant) -> np.ndarray:
+        """Return the simulated states of the windows ``(W, T, 1 + nq + nv)``."""
         from mujoco import rollout
 
-        log, d = self.log, self.drives
-        times = log.state_t[self.starts][:, None] + self.step_t[None] - plant.delay_s + 1e-6
-        control = known(log.target)[np.clip(np.searchsorted(log.t, times, side="right") - 1, 0, len(log.t) - 1)]
-        state, _ = rollout.rollout(d.with_plant(plant, self.asked), self._threads, self.initial, control)
-        error = (np.asarray(state)[:, :, 1 + d.qpos] - self.measured) / self.scale
+        log, target, h = self.log, known(self.log.target), self.drives.model.opt.timestep
+        # The mean of the targets over each step of the simulation, so that a delay acts below its step.
+        times = log.state_t[self.starts][:, None] + self.step_t[None] - plant.number("delay_s", 0.0)
+        knots = np.concatenate([log.t[:1] - 1.0, log.t, log.t[-1:] + 1.0])
+        held = np.concatenate([target[:1], target])
+        area = np.concatenate([np.zeros((1, len(self.scale))), np.cumsum(held * np.diff(knots)[:, None], axis=0)])
+        until = lambda at: np.stack([np.interp(at, knots, column) for column in area.T], -1)  # noqa: E731
+        control = (until(times + h) - until(times)) / h
+        model = self.drives.with_plant(plant, self.asked)
+        return np.asarray(rollout.rollout(model, self._threads, self.initial, control)[0])
+
+    def residuals(self, plant: Plant) -> np.ndarray:
+        """Return the simulated angles less the measured ones, as a share of the motion ``(W, T, J)``."""
+        error = (self.rolled(plant)[:, :, 1 + self.drives.qpos] - self.measured) / self.scale
         return np.where(self.used[:, :, None], np.nan_to_num(error, nan=9.0), 0.0)
 
     def error(self, plant: Plant) -> float:
         """Return the mean error of the replay as a share of the joints' motion; each counts at most 1.5."""
-        return float(self.errors(plant).sum() / (self.used.sum() * len(self.scale)))
+        return float(self.errors(plant).mean())
 
     def errors(self, plant: Plant) -> np.ndarray:
-        """Return the errors of windows and joints ``(W, J)``, summed over their used rows."""
+        """Return the mean errors of the joints ``(J,)``."""
         if plant not in self._errors:
-            self._errors[plant] = np.minimum(np.abs(self.residuals(plant)), 1.5).sum(1)
+            error = np.minimum(np.abs(self.residuals(plant)), 1.5)
+            self._errors[plant] = error.sum((0, 1)) / self.used.sum()
         return self._errors[plant]
 
-    def mixed(self, plants: Sequence[Plant]) -> Plant:
+    def candidates(self, plant: Plant) -> Iterator[Candidate[Plant]]:
+        """Return what may be wrong beside what is known already."""
+        delay_s, there = plant.number("delay_s", 0.0), dict(plant.numbers)
+        starts = [plant.having("delay_s", d) for d in (delay_s, 0.004, 0.011, 0.018, 0.6 * delay_s)]
+        starts = [plant, *(s.having("kd", 1.0) for s in starts)]  # soft or limited drives look late and damped at first
+        for name, part in _PARTS.items():
+            for start in starts if name not in there and not (name == "kp" and self.drives.torque_driven) else ():
+                yield from part.dial.candidates(start, name, _NUISANCE)
+            if name == "kp" and len(self.scale) > 1 and not self.drives.torque_driven:
+                # The joint that gains most by drives of another stiffness may be weak alone.
+                of_all = [self.errors(plant.having("kp", f * plant.number("kp"))) for f in part.dial.grid]
+                joint = self.drives.joints[int(np.argmax(self.errors(plant) - np.min(of_all, axis=0)))]
+                if f"kp {joint}" not in there:
+                    yield from _of_one(joint).dial.candidates(plant, f"kp {joint}", _NUISANCE)
+        if any(name.startswith("limit") for name in there):
+            return
+        text = lambda at: f"torque is clipped: {shortened(list(self.limited(at).values()))}"  # noqa: E731
+        for start in starts:
+            # Other gains of one joint, which are no fault, look like its limit.
+            gains = [start.having("kp", p * start.number("kp")).having("kd", d * start.number("kd"))
+                     for p in (0.85, 1.0, 1.18) for d in (0.7, 1.0, 1.4)]  # fmt: skip
+            limits = [self._all_limited(start, (f,) * len(self.scale)) for f in _LIMITS]
+            yield Candidate(
+                "torque limit", self._mixed([start, *limits, *gains]), text, [self._near_limits, *_NUISANCE]
+            )
+
+    def _limits(self, plant: Plant) -> np.ndarray:
+        return np.array([plant.number(f"limit {joint}", np.inf) for joint in self.drives.joints])
+
+    def _all_limited(self, plant: Plant, limits: Sequence[float]) -> Plant:
+        for joint, limit in zip(self.drives.joints, limits, strict=True):
+            plant = plant.having(f"limit {joint}", float(limit)) if np.isfinite(limit) else plant
+        return plant
+
+    def _mixed(self, plants: Sequence[Plant]) -> Plant:
         """Return the first plant, in which each joint has the limit under which it moves best.
 
         A joint has one only if that explains a tenth of its error.
         """
-        limits = np.array([p.limits or (np.inf,) * len(self.scale) for p in plants])
-        errors = np.array([self.errors(p).sum(0) for p in plants]) * np.where(np.isinf(limits), 0.9, 1.0)
-        chosen = np.take_along_axis(limits, errors.argmin(0)[None], 0)[0]
-        return replace(plants[0], limits=tuple(chosen.tolist()) if np.isfinite(chosen).any() else ())
+        limits = np.array([self._limits(p) for p in plants])
+        errors = np.array([self.errors(p) for p in plants]) * np.where(np.isinf(limits), 0.9, 1.0)
+        return self._all_limited(plants[0], np.take_along_axis(limits, errors.argmin(0)[None], 0)[0].tolist())
 
-    def _near(self, plant: Plant, name: str) -> list[Plant]:
-        value = getattr(plant, name)
-        if name == "limits":
-            moved = [replace(plant, limits=tuple(f * v for v in value)) for f in (0.87, 0.93, 1.07, 1.15)]
-            return [self.mixed([plant, *moved])]
-        values = value * np.array([0.85, 0.93, 1.07, 1.17])
-        if name == "payload":
-            values = value + np.array([-0.05, 0.05])
-        if name == "delay_s":
-            values = np.maximum(0.0, value + np.array([-0.006, -0.002, -0.001, 0.001, 0.002, 0.006]))
-        return [replace(plant, **{name: float(v)}) for v in values]
+    def _near_limits(self, plant: Plant) -> list[Plant]:
+        moved = [self._all_limited(plant, (f * self._limits(plant)).tolist()) for f in (0.87, 0.93, 1.07, 1.15)]
+        return [self._mixed([plant, *moved])]
 
-    def polished(self, plant: Plant, names: Sequence[str], sweeps: int = 3) -> Plant:
-        """Return the best plant near one, one parameter after the other."""
-        for _ in range(sweeps):
-            before = plant
-            for name in names:
-                plant = min((plant, *self._near(plant, name)), key=self.error)
-            if plant == before:
-                break
-        return plant
-
-    def fit(self, start: Plant, name: str = "", delays: Sequence[float] = GRIDS["delay_s"]) -> Plant:
-        """Return the best plant with another delay and damping, and another value of one parameter, if it is named."""
-        tried = [replace(start, delay_s=d) for d in delays]
-        if name == "limits":
-            # Other gains of one joint, which are no fault, look like its limit.
-            gains = [{"kp": p * start.kp, "kd": d * start.kd} for p in (0.85, 1.0, 1.18) for d in (0.7, 1.0, 1.4)]
-            changes = [{"limits": (f,) * len(self.scale)} for f in GRIDS["limits"]] + gains
-            tried = [self.mixed([s, *(replace(s, **change) for change in changes)]) for s in tried]
-        elif name:
-            tried = [replace(s, **{name: v}) for s in tried for v in (getattr(s, name), *GRIDS[name])]
-        best = min(tried, key=self.error)
-        if name not in ("friction", "payload"):
-            return self.polished(best, ["delay_s", *([name] if name else []), "kd"])
-        if self.error(best) > 0.9 * self.error(start):
-            return start
-        return self.polished(best, [name, "delay_s", *(["kp"] if start.kp != 1.0 else [])], 2)
-
-    def fit_all(self) -> Plant:
-        """Return the plant with as few changes as explain the motion."""
-        best = self.fit(_NOMINAL)
-        for names, clear in ((["kp", "limits"], 0.93), (["friction"], 0.85), (["payload"], 0.85)):
-            while names:
-                # Soft or limited drives look late and damped at first.
-                start, delays = best, [best.delay_s]
-                if names[0] in ("kp", "limits"):
-                    start, delays = replace(best, kd=1.0), [0.004, 0.011, 0.018, best.delay_s, 0.6 * best.delay_s]
-                tried = {name: self.fit(start, name, delays) for name in names}
-                name = min(names, key=lambda n: self.error(tried[n]))
-                if self.error(tried[name]) > clear * self.error(best):
-                    break
-                best, clear = tried[name], 0.85
-                names.remove(name)
-        return best
+    def limited(self, plant: Plant) -> dict[str, str]:
+        """Return the joints whose torque limit is well below the model's, with the limit in words."""
+        torques = zip(self.drives.joints, self._limits(plant) * self.asked, self.drives.limit, strict=True)
+        return {joint: f"{joint} at {nm:.3g} N m" for joint, nm, of_model in torques if nm < _LOWER * of_model}
 
 
 def lowest_points(model: Any, data: Any) -> list[tuple[int, np.ndarray]]:
@@ -322,30 +348,6 @@ def lowest_points(model: Any, data: Any) -> list[tuple[int, np.ndarray]]:
     return points
 
 
-@dataclass(frozen=True)
-class _Part:
-    """A parameter of the plant: the fault that it may be, and how clearly the replay must speak for it."""
-
-    fault: str
-    text: str
-    off: Callable[[Any], bool]
-    clear: float = 1.08
-
-
-_PARTS = {
-    "kp": _Part("gain", "the drives are {kp:.2f} times as stiff as the contract says",
-                lambda kp: not 0.72 <= kp <= 1.4),
-    "limits": _Part("torque limit", "torque is clipped: {clipped}", bool, 1.2),
-    "delay_s": _Part("delay", "motion follows a target after {ms:.0f} ms; the training had {trained}",
-                     lambda later_s: later_s > _LATER_S),
-    "friction": _Part("friction", "the joints have {friction:.1f} times the model's friction", lambda f: f > 3.0, 1.25),
-    "payload": _Part("payload", "the robot carries {payload:+.0%} of its mass beside the model's",
-                     lambda share: abs(share) > 0.12, 1.25),
-}  # fmt: skip
-"""Parameter -> its fault; it is one if ``off`` says so (of a delay: of what is more than in training), and the
-replay's error grows by the factor ``clear`` with the model's value."""
-
-
 def solve_plant(
     drives: Drives, log: Log, contract: Contract, trained_delay_s: float | None = None
 ) -> tuple[list[Finding], dict[str, Any]]:
@@ -355,40 +357,50 @@ def solve_plant(
         trained_delay_s: Delay of the training; default: the contract's.
     """
     replay = Replay(drives, log)
-    fitted = replay.fit_all()
+    start = min(_DELAY.candidates(Plant(), "delay_s", _NUISANCE), key=lambda c: replay.error(c.setting))
+    start = start.descended(replay.error)
+    chosen = [start, *explain(start.setting, replay.error, replay.candidates, 0.0, _LEAST, pairs=False, tops=0)]
+    fitted = chosen[-1].setting
     trained = contract.delay_s if trained_delay_s is None else trained_delay_s
-    base, best = replay.error(replace(_NOMINAL, delay_s=trained or 0.0)), replay.error(fitted)
     age_s = 0.0 if log.rows_are_steps or log.age_s is None else float(np.median(log.age_s))
-    delay_s = fitted.delay_s + age_s
-    limits = np.array(fitted.limits or [np.inf] * len(contract.joints))
-    torques = limits * replay.asked
-    low = torques < _LOWER * drives.limit
-    limited = [f"{contract.joints[i]} at {torques[i]:.3g} N m" for i in np.flatnonzero(low)]
-    known_ms = "none that is known" if trained is None else f"{1e3 * trained:.0f} ms"
+    nominal = Plant().having("delay_s", max(0.0, (trained or 0.0) - age_s))
+    delay_s, base, best = fitted.number("delay_s", 0.0) + age_s, replay.error(nominal), replay.error(fitted)
+    numbers, low = dict(fitted.numbers), replay.limited(fitted)
+    # What may be a fault: its name, sentence, numbers, value without it, and how clearly the replay must speak for it.
+    suspects = [
+        (part.dial.fault, part.dial.says(name)(fitted), [name], numbers[name], part.clear)
+        for name, part in {**_PARTS, **{f"kp {j}": _of_one(j) for j in drives.joints}}.items()
+        if name in numbers and part.is_off(numbers[name])
+    ]
+    if low:
+        text, names = f"torque is clipped: {shortened(list(low.values()))}", [f"limit {j}" for j in low]
+        suspects.append(("torque limit", text, names, min(numbers[n] for n in names), 1.2))
+    if delay_s - (0.010 if trained is None else trained) > _LATER_S:
+        of_training = "none that is known" if trained is None else f"{1e3 * trained:.0f} ms"
+        text = f"motion follows a target after {1e3 * delay_s:.0f} ms; the training had {of_training}"
+        suspects.append(("delay", text, ["delay_s"], delay_s, 1.08))
     findings = []
-    for name, part in _PARTS.items():
-        value, usual = getattr(fitted, name), getattr(_NOMINAL, name)
-        differs = value
-        if name == "limits":
-            usual, differs = tuple(np.where(low, np.inf, limits).tolist()), limited
-        elif name == "delay_s":
-            usual, differs = max(0.0, (trained or 0.0) - age_s), delay_s - (0.010 if trained is None else trained)
-        if not part.off(differs):
-            continue
-        others = [n for n in ("kp", "delay_s", "kd") if n != name and getattr(fitted, n) != 1.0]
-        without = replay.error(replay.polished(replace(fitted, **{name: usual}), others, 2))
-        if without < part.clear * best:
-            continue
-        text = part.text.format(ms=1e3 * delay_s, trained=known_ms, clipped=shortened(limited), **vars(fitted))
-        share = float(np.clip((without - best) / max(base, best, 1e-9), 0.0, 1.0))
-        question, number = "timing" if name == "delay_s" else "plant", torques.min() if name == "limits" else value
-        findings.append(Finding(part.fault, question, text, share, {name: float(number)}))
-    nominal = replace(_NOMINAL, delay_s=fitted.delay_s)
-    per_joint = [np.abs(replay.residuals(p)).mean((0, 1)) for p in (nominal, fitted)]
+    for fault, text, names, value, clear in suspects:
+        # The others are estimated again without it.
+        rest = Plant(tuple((n, v) for n, v in fitted.numbers if n not in names))
+        moves = [_NUISANCE[1], *([_PARTS["kp"].dial.move("kp")] if "kp" in dict(rest.numbers) else [])]
+        if names == ["delay_s"]:
+            rest = rest.having("delay_s", nominal.number("delay_s", 0.0))
+        else:
+            moves.append(_NUISANCE[0])
+        rest = replace(start, setting=rest, moves=moves).descended(replay.error).setting
+        joints = [i for i, j in enumerate(drives.joints) if f"kp {j}" in names] or list(range(len(drives.joints)))
+        without, with_it = (float(replay.errors(p)[joints].mean()) for p in (rest, fitted))
+        if without >= clear * with_it:
+            share = float(np.clip((without - with_it) / max(base, best, 1e-9), 0.0, 1.0))
+            question = "timing" if fault == "delay" else "plant"
+            findings.append(Finding(fault, question, text, share, {names[0].split()[0]: float(value)}))
+    nominal = nominal.having("delay_s", fitted.number("delay_s", 0.0))
     figures = {
         "error": base, "error_fitted": best, "delay_s": delay_s,
-        **{n: getattr(fitted, n) for n in ("kp", "kd", "friction", "payload")},
-        "joints": {j: [float(a), float(b)] for j, a, b in zip(contract.joints, *per_joint, strict=True)},
+        **{n: fitted.number(n, part.usual) for n, part in _PARTS.items()}, "kd": fitted.number("kd"),
+        "joints": {j: [float(a), float(b)] for j, a, b in
+                   zip(contract.joints, replay.errors(nominal), replay.errors(fitted), strict=True)},
         "parting": parting(replay, fitted, contract.joints),
     }  # fmt: skip
     return findings, figures
@@ -401,11 +413,27 @@ def parting(replay: Replay, plant: Plant, joints: Sequence[str]) -> dict[str, An
     worse = np.flatnonzero(error.max(1) > limit)
     first = int(worse[0]) if len(worse) else int(np.argmax(error.max(1)))
     joint = int(np.argmax(error[first]))
-    k, d = replay.starts[first], replay.drives
-    simulated = replay.residuals(plant)[first, :, joint] * replay.scale[joint] + replay.measured[first, :, joint]
+    d, used = replay.drives, replay.used[first]
+    state = replay.rolled(plant)[first]
+    simulated, measured = state[:, 1 + d.qpos], replay.measured[first]
+    poses = []
+    for row in np.flatnonzero(used)[np.linspace(0, used.sum() - 1, 5).astype(int)]:
+        qpos = state[row, 1 : 1 + d.model.nq]
+        robot = qpos.copy()
+        robot[d.qpos] = measured[row]
+        poses.append([drawn(d.model, robot), drawn(d.model, qpos)])
     return {
-        "time_s": float(replay.log.state_t[k]), "joint": joints[joint], "apart": bool(len(worse)),
-        "error": float(error[first, joint]), "t": (replay.step_t + d.model.opt.timestep).tolist(),
-        "measured": replay.measured[first, :, joint].tolist(),
-        "simulated": [float(v) if ok else None for v, ok in zip(simulated, replay.used[first], strict=True)],
+        "time_s": float(replay.log.state_t[replay.starts[first]]), "joint": joints[joint], "apart": bool(len(worse)),
+        "error": float(error[first, joint]), "t": (replay.step_t[used] + d.model.opt.timestep).tolist(),
+        "measured": measured[used, joint].tolist(), "simulated": simulated[used, joint].tolist(), "poses": poses,
     }  # fmt: skip
+
+
+def drawn(model: Any, qpos: np.ndarray) -> list[list[list[float]]]:
+    """Return a line of points (x, y, z) for each body: from its parent's origin to its own, and to its centre."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    parents = np.where(model.body_parentid == 0, np.arange(model.nbody), model.body_parentid)
+    return np.round(np.stack([data.xpos[parents], data.xpos, data.xipos], 1)[1:], 4).tolist()

@@ -95,9 +95,12 @@ class Dial:
 
     def candidates(self, setting: S, name: str, more: Sequence[Callable[[S], Iterable[S]]] = ()) -> list[Candidate[S]]:
         """Return a candidate for each value of the grid; ``more``: further moves."""
-        text = lambda at: self.text.format(name=name, value=at.number(name), ms=1e3 * at.number(name))  # noqa: E731
         moves = [self.move(name), *more]
-        return [Candidate(self.fault, setting.having(name, float(v)), text, moves) for v in self.grid]
+        return [Candidate(self.fault, setting.having(name, float(v)), self.says(name), moves) for v in self.grid]
+
+    def says(self, name: str) -> Callable[[Setting], str]:
+        """Return what gives the sentence about a setting."""
+        return lambda at: self.text.format(name=name, value=at.number(name), ms=1e3 * at.number(name))
 
 
 def explain(
@@ -107,6 +110,7 @@ def explain(
     sound: float,
     least: float,
     pairs: bool = True,
+    tops: int = 3,
 ) -> list[Candidate[S]]:
     """Return the candidates that explain an error, the greatest first; each setting has those before it.
 
@@ -115,6 +119,7 @@ def explain(
         candidates: Returns what may be wrong beside what a setting has already.
         sound: Error below which nothing is wrong.
         least: Share of the error by which a candidate must lower it.
+        tops: How many of the best are taken to the best setting near theirs, beside the best of each fault.
         pairs: Whether to look for two that explain together what none explains alone.
     """
 
@@ -124,7 +129,7 @@ def explain(
         heads: dict[str, int] = {}
         for i, candidate in enumerate(found):
             heads.setdefault(candidate.fault, i)
-        for i in {*range(min(3, len(found))), *itertools.islice(heads.values(), _HEADS)}:
+        for i in {*range(min(tops, len(found))), *itertools.islice(heads.values(), _HEADS)}:
             found[i] = found[i].descended(error)
         return sorted(found, key=lambda c: error(c.setting))
 
