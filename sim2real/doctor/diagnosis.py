@@ -56,8 +56,7 @@ class Diagnosis:
             at = self.figures["plant"]["parting"]
             return (f"None of contract, timing and plant explains it: model and robot part at {at['time_s']:.2f} s, "
                     f"at {at['joint']}.")  # fmt: skip
-        asked = " and ".join(q for q in ("contract", "timing", "plant") if q in self.figures)
-        return f"Nothing is wrong that the log shows: {asked} are as in training."
+        return f"Nothing is wrong that the log shows: {', '.join(self.figures)} are as in training."
 
     def to_dict(self) -> dict[str, Any]:
         """Return the diagnosis as plain data."""

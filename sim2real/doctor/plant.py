@@ -388,11 +388,12 @@ def solve_plant(
             rest = rest.having("delay_s", nominal.number("delay_s", 0.0))
         else:
             moves.append(_NUISANCE[0])
+        gap = replay.error(rest) - best
         rest = replace(start, setting=rest, moves=moves).descended(replay.error).setting
         joints = [i for i, j in enumerate(drives.joints) if f"kp {j}" in names] or list(range(len(drives.joints)))
         without, with_it = (float(replay.errors(p)[joints].mean()) for p in (rest, fitted))
         if without >= clear * with_it:
-            share = float(np.clip((without - with_it) / max(base, best, 1e-9), 0.0, 1.0))
+            share = float(np.clip(gap / max(base - best, gap, 1e-9), 0.0, 1.0))
             question = "timing" if fault == "delay" else "plant"
             findings.append(Finding(fault, question, text, share, {names[0].split()[0]: float(value)}))
     nominal = nominal.having("delay_s", fitted.number("delay_s", 0.0))

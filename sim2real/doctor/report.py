@@ -15,6 +15,7 @@ from sim2real.view.page import write_page
 from sim2real.view.style import BLUE, INK, ORANGE, PHONE_IN, ROLES, new_figure, styled, to_svg
 
 PAGE = "doctor.html"
+_LOOKS = {"measured": ROLES["measured"], "simulated": ROLES["identified"]}
 _QUESTIONS = {
     "contract": ("Contract", "Does the network see and move what it was trained with?"),
     "timing": ("Timing", "Does it act at the times that it was trained with?"),
@@ -42,7 +43,7 @@ def write_diagnosis(folder: Path, diagnosis: Diagnosis, log: Log, name: str) -> 
         else:
             rows = [[j, number(a), number(b)] for j, (a, b) in figures["joints"].items()]
             blocks.append(TableBlock("Error by joint, as a share of its motion", ("joint", "model", "fitted"), rows))
-            blocks.append(_parting(figures["parting"]))
+            blocks += [_parting(figures["parting"]), _poses(figures["parting"])]
             if own:
                 what = ", ".join(sorted({n for f in own for n in f.numbers})) or "the delay"
                 blocks.append(ListBlock("Next", [
@@ -90,10 +91,8 @@ def _periods(log: Log, trained_hz: float) -> FigureBlock:
 def _parting(at: Mapping[str, Any]) -> FigureBlock:
     def draw(axis: Any) -> None:
         times = at["time_s"] + np.array(at["t"])
-        for name, role in (("measured", "measured"), ("simulated", "identified")):
-            values = np.array(at[name], float)
-            there, look = np.isfinite(values), ROLES[role]
-            axis.plot(times[there], values[there], color=look.color, linestyle=look.dash, marker=".", label=name)
+        for name, look in _LOOKS.items():
+            axis.plot(times, at[name], color=look.color, linestyle=look.dash, marker=".", label=name)
         axis.set_xlabel("time [s]")
         axis.set_ylabel(f"{at['joint']} [rad]")
         axis.legend()
@@ -101,3 +100,22 @@ def _parting(at: Mapping[str, Any]) -> FigureBlock:
     first = "The first moment in which the fitted model leaves the robot"
     word = first if at["apart"] else "The worst moment of the replay"
     return _figure(draw, "parting", f"{word}: {at['time_s']:.2f} s, {at['joint']}.")
+
+
+def _poses(at: Mapping[str, Any]) -> FigureBlock:
+    """Draw the bodies of robot and model from one side, at some moments of a window, beside each other."""
+
+    def draw(axis: Any) -> None:
+        points = np.array(at["poses"])  # moment, robot or model, body, point, coordinate
+        wide = int(np.ptp(points[..., 1]) > np.ptp(points[..., 0]))  # the side from which more is seen
+        step = 1.3 * max(np.ptp(points[..., wide]), 0.3 * np.ptp(points[..., 2]))
+        for k, moment in enumerate(points):
+            for bodies, (name, look) in zip(moment, _LOOKS.items(), strict=True):
+                x, z = bodies[..., wide].T + k * step, bodies[..., 2].T
+                lines = axis.plot(x, z, color=look.color, linestyle=look.dash)
+                lines[0].set_label(name if k == 0 else None)
+        axis.set_aspect("equal", "datalim")
+        axis.set_axis_off()
+        axis.legend()
+
+    return _figure(draw, "poses", f"Robot and model in the {1e3 * (at['t'][-1] - at['t'][0]):.0f} ms from there on.")
