@@ -281,12 +281,14 @@ class Replay:
     def candidates(self, plant: Plant) -> Iterator[Candidate[Plant]]:
         """Return what may be wrong beside what is known already."""
         delay_s, there = plant.number("delay_s", 0.0), dict(plant.numbers)
-        starts = [plant.having("delay_s", d) for d in (delay_s, 0.004, 0.011, 0.018, 0.6 * delay_s)]
-        starts = [plant, *(s.having("kd", 1.0) for s in starts)]  # soft or limited drives look late and damped at first
+        # Soft or limited drives look late and damped at first.
+        starts = [plant, *(plant.having("kd", 1.0).having("delay_s", d) for d in (delay_s, 0.011, 0.6 * delay_s))]
         for name, part in _PARTS.items():
-            for start in starts if name not in there and not (name == "kp" and self.drives.torque_driven) else ():
+            if name in there or (name == "kp" and self.drives.torque_driven):
+                continue
+            for start in starts if name == "kp" else starts[:1]:
                 yield from part.dial.candidates(start, name, _NUISANCE)
-            if name == "kp" and len(self.scale) > 1 and not self.drives.torque_driven:
+            if name == "kp" and len(self.scale) > 1:
                 # The joint that gains most by drives of another stiffness may be weak alone.
                 of_all = [self.errors(plant.having("kp", f * plant.number("kp"))) for f in part.dial.grid]
                 joint = self.drives.joints[int(np.argmax(self.errors(plant) - np.min(of_all, axis=0)))]
@@ -298,7 +300,7 @@ class Replay:
         for start in starts:
             # Other gains of one joint, which are no fault, look like its limit.
             gains = [start.having("kp", p * start.number("kp")).having("kd", d * start.number("kd"))
-                     for p in (0.85, 1.0, 1.18) for d in (0.7, 1.0, 1.4)]  # fmt: skip
+                     for p, d in ((0.85, 1.0), (1.18, 1.0), (1.0, 0.7), (1.0, 1.4))]  # fmt: skip
             limits = [self._all_limited(start, (f,) * len(self.scale)) for f in _LIMITS]
             yield Candidate(
                 "torque limit", self._mixed([start, *limits, *gains]), text, [self._near_limits, *_NUISANCE]
@@ -359,7 +361,7 @@ def solve_plant(
     replay = Replay(drives, log)
     start = min(_DELAY.candidates(Plant(), "delay_s", _NUISANCE), key=lambda c: replay.error(c.setting))
     start = start.descended(replay.error)
-    chosen = [start, *explain(start.setting, replay.error, replay.candidates, 0.0, _LEAST, pairs=False, tops=0)]
+    chosen = [start, *explain(start.setting, replay.error, replay.candidates, 0.0, _LEAST, dear=True)]
     fitted = chosen[-1].setting
     trained = contract.delay_s if trained_delay_s is None else trained_delay_s
     age_s = 0.0 if log.rows_are_steps or log.age_s is None else float(np.median(log.age_s))

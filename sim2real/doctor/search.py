@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Generic, Self, TypeVar
@@ -109,8 +108,7 @@ def explain(
     candidates: Callable[[S], Iterable[Candidate[S]]],
     sound: float,
     least: float,
-    pairs: bool = True,
-    tops: int = 3,
+    dear: bool = False,
 ) -> list[Candidate[S]]:
     """Return the candidates that explain an error, the greatest first; each setting has those before it.
 
@@ -119,17 +117,14 @@ def explain(
         candidates: Returns what may be wrong beside what a setting has already.
         sound: Error below which nothing is wrong.
         least: Share of the error by which a candidate must lower it.
-        tops: How many of the best are taken to the best setting near theirs, beside the best of each fault.
-        pairs: Whether to look for two that explain together what none explains alone.
+        dear: Whether an error takes long: fewer candidates are followed, and two that explain only together are missed.
     """
 
     def ranked(setting: S) -> list[Candidate[S]]:
-        """Return the candidates, the best ones of all and of each fault at their best settings, in their order."""
+        """Return the candidates in their order; the best of all and of each fault have the best setting near theirs."""
         found = sorted(candidates(setting), key=lambda c: error(c.setting))
-        heads: dict[str, int] = {}
-        for i, candidate in enumerate(found):
-            heads.setdefault(candidate.fault, i)
-        for i in {*range(min(tops, len(found))), *itertools.islice(heads.values(), _HEADS)}:
+        of_faults = list({c.fault: i for i, c in reversed(list(enumerate(found)))}.values())
+        for i in {*range(min(0 if dear else 3, len(found))), *sorted(of_faults)[: 3 if dear else _HEADS]}:
             found[i] = found[i].descended(error)
         return sorted(found, key=lambda c: error(c.setting))
 
@@ -139,7 +134,7 @@ def explain(
         if found and before - error(found[0].setting) >= max(least * before, 0.4 * sound):
             chosen.append(found[0])
         else:
-            heads = {c.fault: c for c in reversed(found)} if pairs else {}
+            heads = {c.fault: c for c in reversed(found)} if not dear else {}
             firsts = sorted(heads.values(), key=lambda c: error(c.setting))[:_HEADS]
             both = [(first, second[0]) for first in firsts if (second := ranked(first.setting))]
             best = min(both, key=lambda pair: error(pair[1].setting), default=None)
