@@ -289,10 +289,11 @@ class Replay:
             for start in starts if name == "kp" else starts[:1]:
                 yield from part.dial.candidates(start, name, _NUISANCE)
             if name == "kp" and len(self.scale) > 1:
-                # The joint that gains most by drives of another stiffness may be weak alone.
+                # The joint that moves better with drives of another stiffness may be weak alone.
                 of_all = [self.errors(plant.having("kp", f * plant.number("kp"))) for f in part.dial.grid]
-                joint = self.drives.joints[int(np.argmax(self.errors(plant) - np.min(of_all, axis=0)))]
-                if f"kp {joint}" not in there:
+                better = self.errors(plant) - np.min(of_all, axis=0)
+                joint = self.drives.joints[int(np.argmax(better))]
+                if better.max() > 0.0 and f"kp {joint}" not in there:
                     yield from _of_one(joint).dial.candidates(plant, f"kp {joint}", _NUISANCE)
         if any(name.startswith("limit") for name in there):
             return
