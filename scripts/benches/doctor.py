@@ -1,4 +1,7 @@
-"""The doctor on robots drawn at random, each deployed with one fault, with two, or with none."""
+"""The doctor on robots drawn at random, each deployed with one fault, with two, or with none.
+
+With ``--efferent`` the package efferent, if it is installed, audits the same deployments.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +17,12 @@ from pathlib import Path
 
 import numpy as np
 
-from benches.robots_that_fail import FAULTS, KINDS, deploy, draw, draw_faults, kinds_for, write_case
+from benches.robots_that_fail import FAULTS, KINDS, Robot, deploy, draw, draw_faults, kinds_for, write_case
 from benches.rows import Report, Row, markdown, missed, row
+from sim2real.doctor.contract import Policy, read_policy
+from sim2real.doctor.diagnosis import diagnose
+from sim2real.doctor.log import read_deployment
+from sim2real.doctor.plant import Drives, driven_joints
 
 QUICK = {"robots": 1, "sound": 1, "pairs": 1, "seconds": 4.0, "kinds": ["pendulum"], "faults": ["scale"]}
 
@@ -28,16 +35,12 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seconds", type=float, default=15.0, help="length of a deployment [s]")
     parser.add_argument("--faults", nargs="*", default=list(FAULTS), help="faults that are drawn")
     parser.add_argument("--kinds", nargs="*", default=list(KINDS), help="kinds of robots that are drawn")
+    parser.add_argument("--efferent", action="store_true", help="audit each deployment with efferent too")
     parser.add_argument("--first-seed", type=int, default=0, help="seed of the first robot")
 
 
-def one(seconds: float, case: tuple[str, int, tuple[str, ...]]) -> tuple[list[str], float]:
-    """Deploy a robot with faults; return what the doctor names, and its time [s]."""
-    from sim2real.doctor.contract import read_policy
-    from sim2real.doctor.diagnosis import diagnose
-    from sim2real.doctor.log import read_deployment
-    from sim2real.doctor.plant import Drives, driven_joints
-
+def one(seconds: float, beside: bool, case: tuple[str, int, tuple[str, ...]]) -> tuple[list[str], float, list[str]]:
+    """Deploy a robot with faults; return what the doctor names, its time [s], and what efferent names."""
     kind, seed, faults = case
     rng = np.random.default_rng([seed, 7])
     robot = draw(kind, seed)
@@ -49,7 +52,55 @@ def one(seconds: float, case: tuple[str, int, tuple[str, ...]]) -> tuple[list[st
         policy = read_policy(files["policy"], files["contract"], joints)
         log = read_deployment(files["log"], policy.contract.joints, joints)
         found = diagnose(policy, log, Drives(files["mjcf"], policy.contract), None, joints)
-        return found.faults, time.perf_counter() - begin
+        took_s = time.perf_counter() - begin
+        return found.faults, took_s, audit(robot, signals, Path(folder)) if beside else []
+
+
+_HINTS = {"PERMUTATION": ("joint order", "left and right"), "WORLD-frame": ("world frame",), "SIGN FLIP": ("sign",),
+          "scale": ("scale",), "DEGREES": ("scale",), "PREVIOUS step": ("delay",)}  # fmt: skip
+"""Words of efferent's hints -> the faults that they name."""
+
+
+def audit(robot: Robot, signals: dict[str, np.ndarray], folder: Path) -> list[str]:
+    """Return the faults that efferent names in a deployment; ``wrong``: it finds a difference.
+
+    Its audit gets all signals of the log, and the newest step of each term: it stacks a history in another way than
+    these policies. Its doctor gets the network with what it was given and gave.
+    """
+    import efferent
+    import onnx
+    import yaml
+
+    c = robot.contract
+    terms = [("joint_pos_rel" if t.kind == "joint_pos" else {"ang_vel": "base_ang_vel", "gravity": "projected_gravity"}
+              .get(t.kind, t.kind), t) for t in c.observation]  # fmt: skip
+    names = [f"c{i}" for i in range(signals["command"].shape[1])]
+    graph = onnx.load_from_string(robot.network).graph
+    manifest = {
+        "policy": {"input": graph.input[0].name, "output": graph.output[0].name},
+        "control": {"rate_hz": c.rate_hz, "action_scale": c.per_joint("action_scale").tolist()},
+        "joints": [{"name": j, "default": float(p)} for j, p in
+                   zip(c.joints, c.per_joint("default_joint_pos"), strict=True)],
+        "observation": [{"term": name, "scale": t.scale} | ({"names": names} if name == "command" else {})
+                        for name, t in terms],
+    }  # fmt: skip
+    (folder / "manifest.yaml").write_text(yaml.safe_dump(manifest))
+    newest = np.concatenate([signals["observation"][:, c.block(i, 0)] for i in range(len(terms))], axis=1)
+    given = {k: signals[k] for k in ("t", "q", "dq", "quat", "gyro", "command", "action") if k in signals}
+    np.savez(folder / "audit.npz", obs=newest, **given)
+    report = efferent.audit(folder / "manifest.yaml", folder / "audit.npz")
+    hints = " ".join(term.hint for term in report.terms)
+    named = {fault for word, faults in _HINTS.items() if word in hints for fault in faults}
+    (folder / "network.onnx").write_bytes(robot.network)
+    late = signals["t"] > 0.6  # a walking robot's actions are blended in before
+    seen = Policy(robot.network, c).normalised(signals["observation"])
+    np.savez(folder / "replay.npz", obs=seen[late], actions=signals["action"][late])
+    replay = efferent.doctor(
+        folder / "network.onnx", manifest=folder / "manifest.yaml", reference=folder / "replay.npz"
+    )
+    if any(check.name == "reference replay" for check in replay.failures):
+        named.add("normaliser")
+    return sorted(named) + ["wrong"] * (not report.passed)
 
 
 def run(options: argparse.Namespace) -> Report:
@@ -67,27 +118,29 @@ def run(options: argparse.Namespace) -> Report:
 
     workers = min(2, os.cpu_count() or 1)
     with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
-        results = list(pool.map(partial(one, options.seconds), cases))
+        results = list(pool.map(partial(one, options.seconds, options.efferent), cases))
     rows: list[Row] = []
+    of = lambda wanted: [(set(n), set(e)) for (_, _, f), (n, _, e) in zip(cases, results, strict=True) if wanted(f)]  # noqa: E731
     for fault in options.faults:
-        own = [named for (_, _, faults), (named, _) in zip(cases, results, strict=True) if faults == (fault,)]
-        hits, more = sum(fault in named for named in own), sum(len(set(named) - {fault}) > 0 for named in own)
+        own = of(lambda faults, fault=fault: faults == (fault,))
+        hits, more = sum(fault in named for named, _ in own), sum(len(named - {fault}) > 0 for named, _ in own)
+        theirs = (
+            f"; efferent names {sum(fault in e for _, e in own)}, and finds {sum('wrong' in e for _, e in own)} wrong"
+        )
         if own:
-            goal = f">= {0.9 * len(own):g}"
-            rows.append(row(f"doctor/{fault}", hits, f"of {len(own)}", f"{more} with another name too", goal))
-    sound = [named for (_, _, faults), (named, _) in zip(cases, results, strict=True) if not faults]
-    alarms = sum(bool(named) for named in sound)
-    rows.append(row("doctor/false alarms", alarms, f"of {len(sound)}", "", "<= 2"))
-    named_of = [(set(faults), set(named)) for (_, _, faults), (named, _) in zip(cases, results, strict=True)]
-    both = [faults <= named for faults, named in named_of if len(faults) == 2]
-    if both:
+            text = f"{more} with another name too{theirs * options.efferent}"
+            rows.append(row(f"doctor/{fault}", hits, f"of {len(own)}", text, f">= {0.9 * len(own):g}"))
+    sound = of(lambda faults: not faults)
+    text = f"efferent: {sum(bool(e) for _, e in sound)}" * options.efferent
+    rows.append(row("doctor/false alarms", sum(bool(n) for n, _ in sound), f"of {len(sound)}", text, "<= 2"))
+    if both := [set(f) <= set(n) for (_, _, f), (n, _, _) in zip(cases, results, strict=True) if len(f) == 2]:
         rows.append(row("doctor/two faults", sum(both), f"of {len(both)}", "", f">= {0.6 * len(both):g}"))
-    slowest = max(took_s for _, took_s in results)
+    slowest = max(took_s for _, took_s, _ in results)
     rows.append(
         row("doctor/longest", round(slowest, 1), "s", f"logs of {options.seconds:g} s, {workers} processes", "")
     )
-    listed = [{"kind": k, "seed": s, "faults": list(f), "named": n, "took_s": round(t, 1)}
-              for (k, s, f), (n, t) in zip(cases, results, strict=True)]  # fmt: skip
+    listed = [{"kind": k, "seed": s, "faults": list(f), "named": n, "took_s": round(t, 1), "efferent": e}
+              for (k, s, f), (n, t, e) in zip(cases, results, strict=True)]  # fmt: skip
     return {"rows": rows, "cases": listed}
 
 
