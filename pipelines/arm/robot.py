@@ -13,12 +13,11 @@ from sim2real.arrays import namespace
 from sim2real.later import jax, jnp
 from sim2real.robots.messages import JointReading
 from sim2real.robots.probe import Probe
-from sim2real.robots.robot import Robot
+from sim2real.robots.robot import Embedded, Robot
 from sim2real.robots.servo.model import Hand, ServoModel, friction_causes
 from sim2real.robots.servo.servos import DataSheet, JointSensor, ServoDrive, Servos
 from sim2real.robots.servo.targets import target_tasks
 from sim2real.robots.servo.task import Aim, AimTask, ServoAgent, ServoMoment, uniform
-from sim2real.robots.session import Embedded
 from sim2real.types import Array, Key
 
 SERVOS = Servos(

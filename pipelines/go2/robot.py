@@ -8,7 +8,7 @@ from types import MappingProxyType
 
 import jax.numpy as jnp
 
-from sim2real.robots.session import Embedded
+from sim2real.robots.robot import Embedded
 from sim2real.robots.walking.drive import LegMotors, Place
 from sim2real.robots.walking.robot import ComposedRobot
 from sim2real.robots.walking.task import Moment, Term

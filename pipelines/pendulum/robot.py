@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,20 +18,20 @@ from sim2real.robots.agent import AgentParams
 from sim2real.robots.loop import Draw
 from sim2real.robots.messages import EpisodeStart
 from sim2real.robots.probe import Probe
-from sim2real.robots.robot import Robot, RobotAgent, RobotDrive, RobotModel, RobotSensor, RobotTask
-from sim2real.robots.session import Embedded, Session
+from sim2real.robots.robot import Embedded, Robot, RobotAgent, RobotDrive, RobotModel, RobotSensor, RobotTask
 from sim2real.types import Key, Scalar
 
 from .mjcf import HINGE, STEP_S, mjcf_of
 from .model import HISTORY, Agent, Command, Measurement, PendulumParams, PendulumWorld, causes, dynamics, from_groups
 
 if TYPE_CHECKING:
-    from sim2real.hardware.device import Reading
+    from sim2real.hardware.device import Device, Reading
     from sim2real.hardware.dynamixel import DynamixelServos
     from sim2real.hardware.joint import Joint
     from sim2real.hardware.safety.following import Following
     from sim2real.hardware.safety.gate import GateConfig
     from sim2real.hardware.safety.limits import GateLimits
+    from sim2real.hardware.safety.rig import Rig
 
 SERVO_ID = 1
 LIMIT_V = 2.0
@@ -75,8 +74,13 @@ class HingeDrive(RobotDrive):
     def __init__(self, mounting: tuple[Joint, ...] = ()) -> None:
         self._mounting = mounting
 
-    @cached_property
-    def embedded(self) -> Embedded:
+    @property
+    def mounting(self) -> tuple[Joint, ...]:
+        from sim2real.hardware.joint import Joint
+
+        return self._mounting or (Joint(HINGE),)
+
+    def embedded(self, hanging: bool = False) -> Embedded:
         from sim2real.emulation.dynamixel import EmulatorConfig
 
         emulator = EmulatorConfig(
@@ -89,19 +93,7 @@ class HingeDrive(RobotDrive):
         )
         return Embedded(f"{Path(__file__).with_name('plant.py')}:PendulumPlant", emulator)
 
-    def connect(self, port: str, limits: GateLimits, truth_path: Path, seed: int, hanging: bool = False) -> Session:
-
-        def device(port: str) -> DynamixelServos:
-            return self.make_device(port, limits.servo_watchdog_s)
-
-        from sim2real.hardware.joint import Joint
-
-        mounting = self._mounting or (Joint(HINGE),)
-        embedded = self.embedded.mounted(mounting, zero_rad=0.0)
-        return Session(port, device, self.gate(limits), embedded, truth_path, seed, mounting)
-
-    def make_device(self, port: str, silence_s: float) -> DynamixelServos:
-        """Return the servo on a port, not opened yet; ``silence_s``: longest silence while torque is on [s]."""
+    def device(self, port: str, silence_s: float, embedded: bool) -> DynamixelServos:
         from sim2real.hardware.bus.port import BusConfig
         from sim2real.hardware.dynamixel import DynamixelServos, VoltageDrive
 
@@ -109,17 +101,16 @@ class HingeDrive(RobotDrive):
 
         return DynamixelServos(BusConfig.patient(port, 1_000_000, silence_s), [SERVO_ID], VoltageDrive(SUPPLY_V))
 
-    def gate(self, limits: GateLimits) -> GateConfig:
+    def gate(self, limits: GateLimits, device: Device | None = None) -> GateConfig:
         return limits.gate(limits.limit, joints=(HINGE,))
 
-    def prepare(self, session: Session, settle_s: float) -> None:
+    def prepare(self, rig: Rig, settle_s: float) -> None:
         """Bring the pendulum to rest hanging down: friction can hold it upright, and then it is pushed over.
 
         Raises:
             SafetyStop: It does not hang after five pushes, or the gate stopped it.
             HardwareLost: It does not come to rest within ``settle_s`` [s].
         """
-        rig = session.rig
         for _ in range(_PUSHES):
             angle = rig.wait_until_still(settle_s).position_rad[0]
             if np.cos(angle) < -0.95:

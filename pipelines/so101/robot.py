@@ -18,12 +18,11 @@ from sim2real.identification.parameters import Parameter
 from sim2real.later import jax, jnp
 from sim2real.robots.messages import JointReading
 from sim2real.robots.probe import Probe
-from sim2real.robots.robot import Robot
+from sim2real.robots.robot import Embedded, Robot
 from sim2real.robots.servo.model import Hand, ServoModel, friction_causes, goal_offsets, servo_parameters
 from sim2real.robots.servo.servos import JointSensor, ServoDrive, Servos, StsSheet
 from sim2real.robots.servo.targets import target_tasks
 from sim2real.robots.servo.task import Aim, AimTask, ServoAgent, ServoMoment, uniform
-from sim2real.robots.session import Embedded
 from sim2real.types import Array, Key
 
 if TYPE_CHECKING:
@@ -125,9 +124,9 @@ def embedded() -> Embedded:
     return Embedded(f"{Path(__file__).with_name('plant.py')}:SO101Plant", emulator)
 
 
-def calibrated(port: str, calibration: Path | None = None) -> StsDrive:
-    """Return the servos' settings with the calibration of the arm on a port."""
-    joints = read(Path(__file__).with_name("calibration.json") if port == "embedded" else calibration or find())
+def calibrated(embedded: bool, calibration: Path | None = None) -> StsDrive:
+    """Return the servos' settings with the calibration of the arm on a port, or of the embedded one."""
+    joints = read(Path(__file__).with_name("calibration.json") if embedded else calibration or find())
     return replace(SHEET.drive, joints=joints)
 
 

@@ -49,8 +49,8 @@ class BusEmulation(Emulation):
     frozen_after_s: float | None = None
     unplugged_after_s: float | None = None
 
-    def robot(self, plant: str, plant_args: Mapping[str, Any], truth_path: Path | None) -> VirtualRobot:
-        return VirtualRobot(plant, self, plant_args, truth_path)
+    def robot(self, physics: Plant, truth_path: Path | None) -> VirtualRobot:
+        return VirtualRobot(physics, self, truth_path=truth_path)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -291,7 +291,11 @@ class PlannedBus(PlannedRobot[B]):
 
 
 class VirtualRobot(VirtualTime):
-    """Emulated servos at `port`, from construction until `stop`; see `Emulation.robot` for the arguments.
+    """Emulated servos at `port`, from construction until `stop`.
+
+    Args:
+        plant: The plant, or its name; see `load_plant`.
+        plant_args: Keyword arguments of a plant that is named.
 
     Attributes:
         port: The address, which `open_port` knows.

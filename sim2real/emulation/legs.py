@@ -9,14 +9,14 @@ from __future__ import annotations
 import random
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from sim2real.emulation.plant import STATE_PERIOD_S, Body, load_plant
+from sim2real.emulation.plant import STATE_PERIOD_S, Body
 from sim2real.emulation.robot import NUMBERS, Emulation, PlannedRobot, VirtualChannel, VirtualTime
 from sim2real.emulation.truth import Kind, TruthLog
 from sim2real.errors import HardwareLost
@@ -60,8 +60,8 @@ class UnitreeEmulation(Emulation):
     alone_after_s: float | None = None
     alone_kd: float = 3.0
 
-    def robot(self, plant: str, plant_args: Mapping[str, Any], truth_path: Path | None) -> VirtualLegs:
-        return VirtualLegs(plant, self, plant_args, truth_path)
+    def robot(self, physics: Body, truth_path: Path | None) -> VirtualLegs:
+        return VirtualLegs(physics, self, truth_path)
 
 
 class EmulatedLegs(PlannedRobot[UnitreeEmulation]):
@@ -250,14 +250,7 @@ class VirtualLegs(VirtualTime):
         links: The open connections.
     """
 
-    def __init__(
-        self,
-        plant: str | Body,
-        config: UnitreeEmulation,
-        plant_args: Mapping[str, Any] | None = None,
-        truth_path: Path | None = None,
-    ) -> None:
-        body: Any = load_plant(plant, plant_args) if isinstance(plant, str) else plant
+    def __init__(self, body: Body, config: UnitreeEmulation, truth_path: Path | None = None) -> None:
         self.links: list[VirtualLink] = []
         super().__init__(body, config, truth_path)
         self.legs: Any = self.planned

@@ -226,7 +226,7 @@ class MountedPlant:
     The plant inside works on the joints' side: it gets their angles, speeds and voltages, and has their true states.
 
     Args:
-        joints: Fields of `Joint`, one row per servo, in the order of the plant's `servo_ids`.
+        joints: One for each servo, in the order of the plant's `servo_ids`.
         zero_rad: The encoder's angle from count 0 where the device reports 0 [rad]; in the plant inside, that of a
             joint at 0.
 
@@ -234,14 +234,11 @@ class MountedPlant:
         UsageError: There is another number of joints than of servos.
     """
 
-    def __init__(
-        self, plant: str, plant_args: Mapping[str, Any], joints: Sequence[Mapping[str, Any]], zero_rad: float
-    ) -> None:
-        inside = load_plant(plant, plant_args)
+    def __init__(self, inside: Plant, joints: Sequence[Joint], zero_rad: float) -> None:
         self._plant, self._zero_rad, self.servo_ids = inside, zero_rad, tuple(inside.servo_ids)
         if len(joints) != len(self.servo_ids):
             raise UsageError(f"{len(joints)} joints are mounted on {len(self.servo_ids)} servos")
-        self._joints = {i: Joint(**fields) for i, fields in zip(self.servo_ids, joints, strict=True)}
+        self._joints = dict(zip(self.servo_ids, joints, strict=True))
         self.advance, self.state, self.truth = inside.advance, inside.state, inside.truth
 
     def command(self, servo_id: int, mode: int, goal: float) -> None:

@@ -66,12 +66,10 @@ class Emulation:
             if is_size and value is not None and value < 0:
                 raise UsageError(f"emulator: {name} = {value} is below 0")
 
-    def robot(self, plant: str, plant_args: Mapping[str, Any], truth_path: Path | None) -> VirtualTime:
-        """Return a running robot with these settings.
+    def robot(self, physics: Any, truth_path: Path | None) -> VirtualTime:
+        """Return a running robot with these settings and a plant or body.
 
         Args:
-            plant: `package.module:Name` or `path/to/file.py:Name`; see `load_plant`.
-            plant_args: Keyword arguments for the plant: JSON-able.
             truth_path: The file of true states and latencies; None: a temporary file.
         """
         raise NotImplementedError

@@ -10,7 +10,9 @@ from __future__ import annotations
 import copy
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Self, TypeVar, Unpack
@@ -45,21 +47,54 @@ from sim2real.robots.loop import (
 from sim2real.robots.messages import EpisodeStart
 from sim2real.robots.nodes import Excitation, PolicyNode, ServoActuator, ServoSensor, SimActuator, SimSensor, in_numpy
 from sim2real.robots.probe import Probe
-from sim2real.robots.session import Embedded, Session
 from sim2real.training.environment.tasks import Rewards
 from sim2real.types import Array, Key, PyTree, Scalar
 
 if TYPE_CHECKING:
     from sim2real.artifacts.identification import Noise
-    from sim2real.hardware.device import Reading
+    from sim2real.emulation.robot import Emulation, VirtualTime
+    from sim2real.hardware.device import Device, Reading
+    from sim2real.hardware.joint import Joint
     from sim2real.hardware.safety.following import Following
+    from sim2real.hardware.safety.gate import GateConfig
     from sim2real.hardware.safety.limits import GateLimits
-    from sim2real.hardware.safety.rig import GateConfig
+    from sim2real.hardware.safety.rig import Rig
     from sim2real.log.importing.mapping import ImportMapping
     from sim2real.stages.config import Defaults
 
 AnyRobot = TypeVar("AnyRobot", bound="RecordedRobot")
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
+
+
+@dataclass(frozen=True)
+class Embedded:
+    """An emulated robot, used for the port ``embedded``.
+
+    Attributes:
+        plant: ``package.module:Name`` or ``path/to/file.py:Name``; see ``load_plant``.
+        emulator: Latencies and faults; its seed is replaced by that of the stage.
+        plant_args: Keyword arguments of the plant.
+    """
+
+    plant: str
+    emulator: Emulation
+    plant_args: Mapping[str, Any] = field(default_factory=dict)
+
+    def start(self, truth_path: Path, seed: int, joints: Sequence[Joint] = (), zero_rad: float = 0.0) -> VirtualTime:
+        """Return the running robot.
+
+        Args:
+            truth_path: File for its true states and latencies.
+            joints: Its mounted joints, in the order of the plant's ``servo_ids``.
+            zero_rad: Reading of an encoder, from count 0, at the device's 0 [rad].
+        """
+        from sim2real.emulation.plant import MountedPlant, load_plant
+
+        plant: Any = load_plant(self.plant, self.plant_args)
+        if not all(joint.is_plain for joint in joints):
+            plant = MountedPlant(plant, joints, zero_rad)
+        truth_path.parent.mkdir(parents=True, exist_ok=True)
+        return replace(self.emulator, seed=seed).robot(plant, truth_path)
 
 
 class RobotSensor(ABC):
@@ -92,7 +127,7 @@ class RobotSensor(ABC):
 
 
 class RobotDrive(ABC):
-    """The commands to the motors, and the session on hardware. Drivers are imported by ``connect``.
+    """The commands to the motors, and the device on hardware, whose driver ``device`` imports.
 
     Attributes:
         rate_hz: Rate of sensor, agent and actuator [Hz].
@@ -102,7 +137,7 @@ class RobotDrive(ABC):
         expected_delay_s: Computation delays of sensor, agent and actuator that phases allow for: a bus transaction, and
             a policy with its thread's wake-up [s].
         probe: The steps by which deploy measures the delay; None: the delay is not measured.
-        embedded: The emulated robot, for the port ``embedded``; None: there is none.
+        zero_rad: Reading of the emulated encoders, from count 0, at the device's 0 [rad].
     """
 
     rate_hz: float
@@ -111,34 +146,83 @@ class RobotDrive(ABC):
     message: Callable[[PyTree], PyTree]
     expected_delay_s: tuple[float, float, float] = (0.002, 0.002, 0.002)
     probe: Probe | None = None
-    embedded: Embedded | None = None
+    zero_rad: float = 0.0
 
     @abstractmethod
-    def connect(self, port: str, limits: GateLimits, truth_path: Path, seed: int, hanging: bool = False) -> Session:
-        """Open the robot, with torque off.
+    def device(self, port: str, silence_s: float, embedded: bool) -> Device:
+        """Return the device on a port, not opened yet.
+
+        Args:
+            silence_s: Longest silence while torque is on [s].
+            embedded: Whether it is the emulated robot's.
+        """
+
+    @property
+    def mounting(self) -> tuple[Joint, ...]:
+        """How each motor's joint is mounted; default: as the device measures and commands it."""
+        return ()
+
+    def embedded(self, hanging: bool = False) -> Embedded | None:
+        """Return the emulated robot, for the port ``embedded``; default: None, there is none.
+
+        Args:
+            hanging: Whether a robot on legs hangs in a stand, to be recorded.
+        """
+        return None
+
+    @contextmanager
+    def connect(
+        self, port: str, limits: GateLimits, truth_path: Path, seed: int, hanging: bool = False
+    ) -> Iterator[Rig]:
+        """Open the robot for the block, with torque off; at its end the torque is off and the port is closed.
 
         Args:
             port: Device file of the port, or ``embedded`` for the emulated robot.
             truth_path: File for the emulated robot's true states and latencies.
+            seed: Seed of the emulated robot's jitter and faults.
             hanging: Whether a robot on legs hangs in a stand, to be recorded.
+
+        Raises:
+            UsageError: The port is ``embedded``, but the robot has none.
+            HardwareLost: The device cannot be opened, or a motor does not answer.
         """
+        # Imported here: training also makes robots, and must not import their drivers.
+        from sim2real.hardware.safety.rig import Rig
+
+        with ExitStack() as stack:
+            is_embedded = port == "embedded"
+            if is_embedded:
+                if (embedded := self.embedded(hanging)) is None:
+                    raise UsageError("this robot has no embedded twin", hint="name its port with --port")
+                robot = stack.enter_context(embedded.start(truth_path, seed, self.mounting, self.zero_rad))
+                port = robot.port
+                # Wait until the last command, torque off, has taken effect, so that it is in the truth file.
+                config = embedded.emulator
+                lasts_s = config.actuation_latency_s + config.actuation_jitter_s + 0.01
+                stack.callback(robot.sleep, lasts_s)
+            device = self.device(port, limits.servo_watchdog_s, is_embedded)
+            yield stack.enter_context(Rig(device, self.gate(limits, device), self.mounting))
 
     @abstractmethod
-    def prepare(self, session: Session, settle_s: float) -> None:
+    def prepare(self, rig: Rig, settle_s: float) -> None:
         """Bring the robot to rest where the task starts; torque is off afterwards.
 
         Args:
             settle_s: Longest time to wait for rest, for each attempt [s].
         """
 
-    def begin(self, session: Session) -> None:  # noqa: B027
+    def begin(self, rig: Rig) -> None:  # noqa: B027
         """Bring the robot, with torque on, to the start of the task, such as legs to their stance; default: nothing.
 
         Called before the first step of an episode.
         """
 
-    def gate(self, limits: GateLimits) -> GateConfig:
-        """Return the limits of commands and measurements; default: the same for each command."""
+    def gate(self, limits: GateLimits, device: Device | None = None) -> GateConfig:
+        """Return the limits of commands and measurements; default: the same for each command.
+
+        Args:
+            device: The device, whose commands may have columns; None: the limits of an excitation.
+        """
         return limits.gate(limits.limit)
 
     def around(self, signal: np.ndarray) -> np.ndarray:
@@ -149,7 +233,7 @@ class RobotDrive(ABC):
         """Return the excitation ``(N, actions)`` of a robot on its feet; None: it has no feet."""
         return None
 
-    def approach(self, session: Session, commands: np.ndarray) -> np.ndarray:
+    def approach(self, rig: Rig, commands: np.ndarray) -> np.ndarray:
         """Return the commands ``(N, actions)`` with a way to the first of them, from where the robot is; default: none.
 
         Args:
@@ -441,9 +525,7 @@ class Robot(RecordedRobot):
 
     # -- graphs on hardware
 
-    def recording_nodes(
-        self, session: Session, signal: np.ndarray | None, standing: bool = False
-    ) -> dict[str, BaseNode]:
+    def recording_nodes(self, rig: Rig, signal: np.ndarray | None, standing: bool = False) -> dict[str, BaseNode]:
         """Return the graph on hardware that plays an excitation ``(N,)`` or ``(N, actions)``, one row a step.
 
         Without an excitation it only measures: it has the sensor alone, and no node sends a command.
@@ -452,35 +534,35 @@ class Robot(RecordedRobot):
             standing: Whether it begins as the task does, such as by standing up.
         """
         if signal is None:
-            return {SENSOR: self._sensor(session)}
+            return {SENSOR: self._sensor(rig)}
         drive = self.drive
         rows = drive.around(np.asarray(signal, np.float64).reshape(-1, len(self.agent.action)))
-        rows = rows if standing else drive.approach(session, rows)
+        rows = rows if standing else drive.approach(rig, rows)
         player = Excitation(AGENT, self.rate_hz, rows, drive.message, delay=drive.expected_delay_s[1])
-        return self._on_hardware(session, player, (lambda: drive.begin(session)) if standing else None)
+        return self._on_hardware(rig, player, (lambda: drive.begin(rig)) if standing else None)
 
     def deployment_nodes(
-        self, session: Session, policy: Runner, trial: int = 0
+        self, rig: Rig, policy: Runner, trial: int = 0
     ) -> tuple[dict[str, BaseNode], dict[str, PyTree]]:
         """Return the graph on hardware that runs a policy, and the agent's parameters: it starts where the robot is.
 
         Args:
             policy: ``reset()`` begins an episode; a call with an observation ``(O,)`` returns the action ``(A,)``.
         """
-        measured = np.asarray(session.rig.measure().position_rad, np.float32)
+        measured = np.asarray(rig.measure().position_rad, np.float32)
         start = self.task.at_rest(trial).replace(position=measured)
         params = {AGENT: in_numpy(self.agent.params(start, None))}
         node = self.agent.make(self.rate_hz, delay=self.drive.expected_delay_s[1])
-        return self._on_hardware(session, PolicyNode(node, policy), lambda: self.drive.begin(session)), params
+        return self._on_hardware(rig, PolicyNode(node, policy), lambda: self.drive.begin(rig)), params
 
-    def _on_hardware(self, session: Session, agent: BaseNode, begin: Callable[[], None] | None) -> dict[str, BaseNode]:
+    def _on_hardware(self, rig: Rig, agent: BaseNode, begin: Callable[[], None] | None) -> dict[str, BaseNode]:
         drive, options = self.drive, {"begin": begin, "delay": self.drive.expected_delay_s[2]}
-        actuator = ServoActuator(ACTUATOR, self.rate_hz, session.rig, drive.command, drive.message, **options)
-        return control_nodes(self._sensor(session), agent, actuator)
+        actuator = ServoActuator(ACTUATOR, self.rate_hz, rig, drive.command, drive.message, **options)
+        return control_nodes(self._sensor(rig), agent, actuator)
 
-    def _sensor(self, session: Session) -> ServoSensor:
+    def _sensor(self, rig: Rig) -> ServoSensor:
         read, rest, delay_s = self.sensor.read, self.sensor.at_rest, self.drive.expected_delay_s[0]
-        return ServoSensor(SENSOR, self.rate_hz, session.rig, read, rest, delay=delay_s)
+        return ServoSensor(SENSOR, self.rate_hz, rig, read, rest, delay=delay_s)
 
     # -- graphs in simulation
 

@@ -46,7 +46,7 @@ def check_robot(robot: RecordedRobot, folder: Path, limits: GateLimits | None = 
     check_identification(robot)
     if isinstance(robot, Robot):
         check_simulation(robot)
-        if robot.drive.embedded is not None:
+        if robot.drive.embedded() is not None:
             check_embedded(robot, folder, limits or GateLimits())
 
 
@@ -125,10 +125,10 @@ def check_simulation(robot: Robot) -> None:
 def check_embedded(robot: Robot, folder: Path, limits: GateLimits) -> None:
     """Check that the embedded robot opens, takes torque, and ends without."""
     truth = folder / "truth.bin"
-    with robot.drive.connect("embedded", limits, truth, 0) as session:
-        reading = session.rig.measure()
+    with robot.drive.connect("embedded", limits, truth, 0) as rig:
+        reading = rig.measure()
         _hold(bool(np.isfinite(reading.position_rad).all()), f"the embedded robot is at {reading.position_rad}")
-        session.rig.start()
+        rig.start()
     effects = read_truth(truth).of(Kind.EFFECT)
     modes = effects["values"][:, 0] if len(effects) else np.empty(0)
     _hold(bool((modes != OperatingMode.OFF).any()), "torque never came on")

@@ -240,9 +240,9 @@ class Flywheels:
 
 def test_a_mounted_plant_is_seen_through_its_encoders():
     centre = np.pi
-    joints = [{"name": "a", "zero_rad": 0.3, "direction": -1, "gear": 2.0}, {"name": "b", "gear": 0.5}]
+    joints = [Joint("a", zero_rad=0.3, direction=-1, gear=2.0), Joint("b", gear=0.5)]
     start = [centre + 0.4, 0.0, 0.0, centre - 1.0]
-    plant = MountedPlant(f"{__file__}:Flywheels", {"start": start}, joints, centre)
+    plant = MountedPlant(Flywheels(start), joints, centre)
     assert plant.servo_ids == (4, 7)
     np.testing.assert_allclose(plant.measure(4), [centre + 0.3 - 0.8, -4.0, -0.5])
     np.testing.assert_allclose(plant.measure(7), [centre - 0.5, 1.0, 0.5])
@@ -260,7 +260,7 @@ def test_a_mounted_plant_is_seen_through_its_encoders():
     assert told[-1] == ("advance", 0.1)
     assert (plant.state(), plant.truth()) == ({"q": 1.0}, {"friction": 3.0})
     with pytest.raises(UsageError, match="1 joints are mounted on 2 servos"):
-        MountedPlant(f"{__file__}:Flywheels", {"start": start}, joints[:1], centre)
+        MountedPlant(Flywheels(start), joints[:1], centre)
 
 
 @pytest.mark.parametrize(

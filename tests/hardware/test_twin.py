@@ -19,7 +19,7 @@ FACTORS = {"gain": 0.87, "damping": 0.252 / 0.23, "armature": 1.25, "friction": 
 def arguments():
     """What the arm's robot hands to a twin."""
     robot = load_robot("arm")
-    return robot.model.twin(robot.drive.embedded.emulator, **FACTORS).plant_args
+    return robot.model.twin(robot.drive.embedded().emulator, **FACTORS).plant_args
 
 
 @pytest.fixture
@@ -80,4 +80,4 @@ def test_unknown_names_are_refused(arguments):
         ServoPlant(**{**arguments, "joints": ["neck", "shoulder", "elbow"]})
     robot = load_robot("arm")
     with pytest.raises(UsageError, match="no factor 'mass'"):
-        robot.model.twin(robot.drive.embedded.emulator, mass=2.0)
+        robot.model.twin(robot.drive.embedded().emulator, mass=2.0)

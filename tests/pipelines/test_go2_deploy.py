@@ -92,7 +92,7 @@ def test_a_recording_moves_the_legs_in_a_stand(tmp_path):
     assert (np.abs(sent[1] - measured[0]) < 0.1).all()
     assert (np.ptp(sent, axis=0) > 0.2).all()
     assert (np.ptp(measured, axis=0) > 0.1).all()
-    assert ROBOT.drive.embedded.plant_args["place"] == "floor"
+    assert ROBOT.drive.embedded().plant_args["place"] == "floor"
 
 
 @pytest.mark.night
@@ -144,7 +144,7 @@ def test_the_load_of_a_robot_on_its_feet(tmp_path, capsys):
 def test_the_gate_has_the_range_of_each_joint():
     from sim2real.hardware.unitree.device import UnitreeLegs
 
-    gate = ROBOT.drive._gate(GateLimits(limit=4.6, slew_per_s=50.0), UnitreeLegs("lo:7"))
+    gate = ROBOT.drive.gate(GateLimits(limit=4.6, slew_per_s=50.0), UnitreeLegs("lo:7"))
     low, high = gate.range
     np.testing.assert_allclose(low[:3, 0], [-1.0472, -1.5708, -2.7227])
     np.testing.assert_allclose(high[6:9, 0], [1.0472, 4.5379, -0.83776])
@@ -152,12 +152,12 @@ def test_the_gate_has_the_range_of_each_joint():
     assert (low[:, 2:4] == 0.0).all()
 
 
-def test_a_robot_without_a_device_is_refused(tmp_path):
+def test_a_robot_without_a_device_is_refused():
     from sim2real.robots.walking.drive import WalkingDrive
 
     drive = WalkingDrive(ROBOT.mjcf, ROBOT.joints, ROBOT.stance, 50.0, (35.0, 0.6))
     with pytest.raises(UsageError, match="no device for port 'eth0'"):
-        drive.connect("eth0", GateLimits(), tmp_path / "truth.bin", 0)
+        drive.device("eth0", 0.1, embedded=False)
 
 
 def test_the_start_motion_folds_the_legs_and_rises():

@@ -9,7 +9,6 @@ import pytest
 
 from sim2real.errors import UsageError
 from sim2real.hardware import feetech as registers
-from sim2real.hardware.safety.limits import GateLimits
 from sim2real.stages.load import load_module, load_robot
 from sim2real.stages.session.excitation import excitation
 
@@ -104,9 +103,9 @@ def test_the_only_calibration_is_taken_and_of_several_the_one_that_is_named(lero
     assert [j.servo_id for j in MODULE.read(MODULE.find())] == [1, 2, 3, 4, 5, 6]
 
 
-def test_an_arm_without_calibration_is_not_opened(lerobot, tmp_path):
+def test_an_arm_without_calibration_is_not_opened(lerobot):
     with pytest.raises(UsageError, match="no calibration in") as told:
-        ROBOT.drive.connect("/dev/ttyACM0", GateLimits(), tmp_path / "truth.bin", 0)
+        ROBOT.drive.device("/dev/ttyACM0", 0.1, embedded=False)
     assert "SO101_CALIBRATION" in str(told.value.hint)
 
 

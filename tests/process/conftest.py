@@ -13,7 +13,7 @@ from sim2real.stages.load import load_robot
 @pytest.fixture
 def lone_robot(tmp_path):
     """An emulated pendulum that does not end with its host."""
-    embedded = load_robot("pendulum").drive.embedded
+    embedded = load_robot("pendulum").drive.embedded()
     with EmulatedProcess(embedded.plant, embedded.emulator, {}, tmp_path / "truth.bin") as robot:
         yield robot
 

@@ -33,18 +33,18 @@ class Arm:
         robot.stop()
 
     def robot(self, seed, plant=None, **faults):
-        embedded = self.drive.embedded.mounted(self.mounting, math.pi)
+        embedded = self.drive.embedded()
         emulator = replace(embedded.emulator, seed=seed, **faults)
         return VirtualRobot(embedded.plant, emulator, {**embedded.plant_args, **(plant or {})})
 
     def device(self, robot, limits):
-        settings = self.drive._settings("embedded") if self.drive._settings else self.servos.sheet.drive
-        return self.drive.make_device(robot.port, settings, limits.servo_watchdog_s)
+        return self.drive.device(robot.port, limits.servo_watchdog_s, embedded=True)
 
     def rig(self, robot, following=True, limits=None):
         """Return a rig with the limits of a real robot, watched by the identified model, or the servos' own figures."""
         limits = limits or self.limits
-        rig = Rig(self.device(robot, limits), self.drive.gate(limits), self.mounting)
+        device = self.device(robot, limits)
+        rig = Rig(device, self.drive.gate(limits, device), self.mounting)
         if following is True:
             rig.follow(self.identified)
         elif following is not None:
@@ -103,17 +103,17 @@ class Pendulum(Arm):
 
         self.mounting = (Joint("hinge"),)
         emulated = self.robot(0)
-        emulator = robot.drive.embedded.emulator
+        emulator = robot.drive.embedded().emulator
         delay_s = emulator.sensing_latency_s + emulator.actuation_latency_s
         self.identified = replace(self.model.following(emulated.plant.truth()), delay_s=delay_s)
         emulated.stop()
 
     def robot(self, seed, plant=None, **faults):
-        embedded = self.drive.embedded
+        embedded = self.drive.embedded()
         return VirtualRobot(embedded.plant, replace(embedded.emulator, seed=seed, **faults), plant)
 
     def device(self, robot, limits):
-        return self.drive.make_device(robot.port, limits.servo_watchdog_s)
+        return self.drive.device(robot.port, limits.servo_watchdog_s, embedded=True)
 
     def raised(self, first):
         """Return a policy that pumps: full voltage in the direction of the motion."""
@@ -159,7 +159,7 @@ class Go2(Arm):
         del following  # by the torque that the motors report
         limits = limits or self.limits
         device = UnitreeLegs(robot.port, drive=LegDrive(lie_s=0.2), silence_s=limits.servo_watchdog_s)
-        return Rig(device, self.drive._gate(limits, device))
+        return Rig(device, self.drive.gate(limits, device))
 
     def raised(self, first):
         return self.policy(0, first)

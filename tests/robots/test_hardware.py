@@ -60,18 +60,18 @@ def episodes(arm, tmp_path_factory):
     folder, robot = tmp_path_factory.mktemp("arm"), arm
     truth, logs = folder / "truth.bin", (folder / "recorded.mcap", folder / "deployed.mcap")
     policy = Steady([1.0, -0.5, 0.25])
-    with robot.drive.connect("embedded", GATE, truth, 3) as session:
-        range_ = session.rig.gate.config.range
+    with robot.drive.connect("embedded", GATE, truth, 3) as rig:
+        range_ = rig.gate.config.range
         config = Config()
-        robot.drive.prepare(session, 5.0)
-        nodes = robot.recording_nodes(session, SIGNAL)
-        recorded = Bench(robot, session, config).run_episode(nodes, {}, logs[0], 1.0, "record")
-        robot.drive.prepare(session, 10.0)
-        nodes, params = robot.deployment_nodes(session, policy, trial=2)
-        deployed = Bench(robot, session, config).run_episode(nodes, params, logs[1], 0.6, "deploy")
-        left = session.rig.wait_until_still(5.0).position_rad
-        robot.drive.prepare(session, 10.0)
-        brought = session.rig.measure().position_rad
+        robot.drive.prepare(rig, 5.0)
+        nodes = robot.recording_nodes(rig, SIGNAL)
+        recorded = Bench(robot, rig, config).run_episode(nodes, {}, logs[0], 1.0, "record")
+        robot.drive.prepare(rig, 10.0)
+        nodes, params = robot.deployment_nodes(rig, policy, trial=2)
+        deployed = Bench(robot, rig, config).run_episode(nodes, params, logs[1], 0.6, "deploy")
+        left = rig.wait_until_still(5.0).position_rad
+        robot.drive.prepare(rig, 10.0)
+        brought = rig.measure().position_rad
     return SimpleNamespace(
         robot=robot,
         range=range_,
@@ -179,20 +179,23 @@ def test_an_arm_that_rests_somewhere_else_is_refused(arm, tmp_path, why):
     else:
         robot = changed(arm, rest=(0.0, 0.9, 0.0))
     with (
-        robot.drive.connect("embedded", replace(GATE, limit=1.3), tmp_path / "truth.bin", 0) as session,
+        robot.drive.connect("embedded", replace(GATE, limit=1.3), tmp_path / "truth.bin", 0) as rig,
         pytest.raises(
             SafetyStop, match=r"joint 'shoulder' rests at .* rad, not within 0\.4 rad of 0(\.9)? rad"
         ) as caught,
     ):
-        robot.drive.prepare(session, 10.0)
+        robot.drive.prepare(rig, 10.0)
     assert "zero of its encoder" in caught.value.hint
     modes = read_truth(tmp_path / "truth.bin").of(Kind.EFFECT)["values"][:, 0]
     assert modes[-3:].tolist() == [OperatingMode.OFF] * 3
 
 
 def test_a_robot_without_an_embedded_twin_has_no_such_port(pair, tmp_path):
-    with pytest.raises(UsageError, match="has no embedded twin") as caught:
-        pair.drive.connect("embedded", GATE, tmp_path / "truth.bin", 0)
+    with (
+        pytest.raises(UsageError, match="has no embedded twin") as caught,
+        pair.drive.connect("embedded", GATE, tmp_path / "truth.bin", 0),
+    ):
+        pass
     assert "--port" in caught.value.hint
     assert not (tmp_path / "truth.bin").exists()
 
@@ -202,9 +205,9 @@ def test_no_command_leaps_where_a_recording_outlasts_its_excitation(name):
     """A Go2 on its feet was told to stretch all legs for the last one or two steps of each log of its load."""
     robot = moving(load_robot(name))
     rest = SimpleNamespace(position_rad=np.full(len(robot.agent.action), 0.1))
-    session = SimpleNamespace(rig=SimpleNamespace(measure=lambda: rest, wait_until_still=lambda *_: rest))
+    rig = SimpleNamespace(measure=lambda: rest, wait_until_still=lambda *_: rest)
     signal = 0.5 + 0.1 * np.linspace(0.0, 1.0, 100)[:, None] * np.ones(len(robot.agent.action))
-    agent = robot.recording_nodes(session, signal, standing=name == "go2")["agent"]
+    agent = robot.recording_nodes(rig, signal, standing=name == "go2")["agent"]
     played = np.array([getattr(agent.step(SimpleNamespace(seq=k))[1], robot.drive.command) for k in range(200)])
     assert np.abs(np.diff(played[98:], axis=0)).max() < 0.03
     np.testing.assert_array_equal(played[-50:], np.tile(played[-1], (50, 1)))

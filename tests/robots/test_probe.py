@@ -97,7 +97,7 @@ def answers_of(plant, step, mode, settings=()):
 def test_the_lag_of_a_robot_holds_at_half_and_at_twice_its_friction(name, arguments, mode, settings):
     """It was one number, measured on the embedded robot, and decided on the real one."""
     drive = load_robot(name).drive
-    plant = load_plant(drive.embedded.plant, arguments)
+    plant = load_plant(drive.embedded().plant, arguments)
     step = drive.probe.step if mode == POSITION else drive.probe.step / 5.0
     found = replace(delays_of(answers_of(plant, step, mode, settings)), lag_s=drive.probe.lag_s)
     assert found.between_s[0] - 0.001 <= 0.03 <= found.between_s[1] + 0.001

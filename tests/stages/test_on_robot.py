@@ -161,7 +161,7 @@ def test_a_recording_knows_the_shares_of_host_and_bus_in_the_delay(tmp_path):
 
 def test_a_recording_by_hand_has_no_command_and_no_torque(tmp_path):
     robot = load_robot("so101")
-    embedded = robot.drive.embedded
+    embedded = robot.drive.embedded()
     start, t_s = np.array(load_module(robot.name, "plant").SO101Plant().data.qpos), np.arange(0.0, 4.0, 1 / 30)
     middle = (np.array(robot.drive.servos.low) + np.array(robot.drive.servos.high)) / 2
     pose = np.vstack([start, middle + 0.3 * np.sin(2 * np.pi * 0.2 * t_s[:, None] + np.arange(6))])

@@ -23,9 +23,8 @@ from sim2real.identification.export.plain import PlainSimulation, converged
 from sim2real.identification.parameters import Parameter
 from sim2real.later import jnp
 from sim2real.robots.messages import EpisodeStart
-from sim2real.robots.robot import RobotModel
+from sim2real.robots.robot import Embedded, RobotModel
 from sim2real.robots.servo.servos import DataSheet, Servos, name_of
-from sim2real.robots.session import Embedded
 from sim2real.types import MjModel, MjSpec, PyTree, Scalar
 
 if TYPE_CHECKING:

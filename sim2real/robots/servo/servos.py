@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -17,8 +16,7 @@ from sim2real.identification.model import Channel
 from sim2real.robots.loop import ACTUATOR
 from sim2real.robots.messages import Goals, JointReading
 from sim2real.robots.probe import Probe
-from sim2real.robots.robot import RobotDrive, RobotSensor
-from sim2real.robots.session import Embedded, Session
+from sim2real.robots.robot import Embedded, RobotDrive, RobotSensor
 
 if TYPE_CHECKING:
     from sim2real.hardware.device import Device, Reading
@@ -27,6 +25,7 @@ if TYPE_CHECKING:
     from sim2real.hardware.joint import Joint
     from sim2real.hardware.safety.gate import GateConfig
     from sim2real.hardware.safety.limits import GateLimits
+    from sim2real.hardware.safety.rig import Rig
 
 
 @dataclass(frozen=True)
@@ -181,11 +180,12 @@ class ServoDrive(RobotDrive):
 
     Args:
         embedded: Returns the emulated robot; None: there is none.
-        settings: Returns the settings of the device on a port; default: those of the data sheet.
+        settings: Returns the device's settings, given whether it is the emulated one; default: the data sheet's.
     """
 
     command, units, message = "goal", MappingProxyType({"goal": "rad"}), Goals
     expected_delay_s = (0.004, 0.003, 0.002)
+    zero_rad = math.pi  # position 0 of a plain joint is where the servo's encoder is at half a turn
 
     def __init__(
         self,
@@ -194,52 +194,43 @@ class ServoDrive(RobotDrive):
         rate_hz: float = 50.0,
         probe: Probe | None = None,
         embedded: Callable[[], Embedded | None] | None = None,
-        settings: Callable[[str], Any] | None = None,
+        settings: Callable[[bool], Any] | None = None,
     ) -> None:
         self.servos, self.rate_hz, self.probe = servos, rate_hz, probe
         self._embedded, self._settings = embedded, settings
 
     @property
-    def embedded(self) -> Embedded | None:
+    def mounting(self) -> tuple[Joint, ...]:
+        return self.servos.mounting
+
+    def embedded(self, hanging: bool = False) -> Embedded | None:
         return self._embedded() if self._embedded else None
 
-    def connect(self, port: str, limits: GateLimits, truth_path: Path, seed: int, hanging: bool = False) -> Session:
-        settings = self._settings(port) if self._settings else self.servos.sheet.drive
-
-        def device(port: str) -> Device:
-            return self.make_device(port, settings, limits.servo_watchdog_s)
-
-        # Position 0 of a plain joint is where the servo's encoder is at half a turn.
-        embedded, mounting = self.embedded, self.servos.mounting
-        embedded = embedded and embedded.mounted(mounting, math.pi)
-        return Session(port, device, self.gate(limits), embedded, truth_path, seed, mounting)
-
-    def make_device(self, port: str, settings: Any, silence_s: float) -> Device:
-        """Return the servos on a port, not opened yet; ``silence_s``: longest silence while torque is on [s]."""
+    def device(self, port: str, silence_s: float, embedded: bool) -> Device:
         from sim2real.hardware.registry import load_device
 
-        s = self.servos
+        s, settings = self.servos, self._settings(embedded) if self._settings else self.servos.sheet.drive
         return load_device(s.device)(port, s.ids, settings, baud_rate=s.baud_rate, silence_s=silence_s)
 
-    def gate(self, limits: GateLimits) -> GateConfig:
+    def gate(self, limits: GateLimits, device: Device | None = None) -> GateConfig:
         s = self.servos
         low, high = np.maximum(s.low, -limits.limit), np.minimum(s.high, limits.limit)
         return limits.gate((tuple(low), tuple(high)), stale="hold", node=ACTUATOR, joints=s.names)
 
-    def prepare(self, session: Session, settle_s: float) -> None:
+    def prepare(self, rig: Rig, settle_s: float) -> None:
         """Bring the joints to rest, slowly; torque is off before and afterwards.
 
         Raises:
             HardwareLost: The robot does not come to rest within ``settle_s`` [s] per attempt.
             SafetyStop: The robot rests at another position, or the gate stopped it.
         """
-        bring_home(session, self.servos, self.rate_hz, settle_s)
+        bring_home(rig, self.servos, self.rate_hz, settle_s)
 
     def around(self, signal: np.ndarray) -> np.ndarray:
         return signal + np.asarray(self.servos.middle or 0.0)
 
-    def approach(self, session: Session, commands: np.ndarray) -> np.ndarray:
-        return approached(commands, session.rig.measure().position_rad, self.rate_hz)
+    def approach(self, rig: Rig, commands: np.ndarray) -> np.ndarray:
+        return approached(commands, rig.measure().position_rad, self.rate_hz)
 
 
 def approached(goals: np.ndarray, position_rad: np.ndarray, rate_hz: float) -> np.ndarray:
@@ -251,7 +242,7 @@ def approached(goals: np.ndarray, position_rad: np.ndarray, rate_hz: float) -> n
     return goals + np.sign(offset) * np.maximum(np.abs(offset) - covered, 0.0)
 
 
-def bring_home(session: Session, servos: Servos, rate_hz: float, settle_s: float) -> None:
+def bring_home(rig: Rig, servos: Servos, rate_hz: float, settle_s: float) -> None:
     """Bring the joints to their rest pose.
 
     Args:
@@ -262,10 +253,10 @@ def bring_home(session: Session, servos: Servos, rate_hz: float, settle_s: float
         SafetyStop: It rests in another pose, or the gate stopped it.
     """
     rest = np.asarray(servos.at_rest)
-    position = session.rig.wait_until_still(settle_s).position_rad
+    position = rig.wait_until_still(settle_s).position_rad
     if np.max(np.abs(position - rest)) > _AT_HOME_RAD:
-        _move(session, position, rest, rate_hz)  # a joint without weight stays where it was left
-        position = session.rig.wait_until_still(settle_s).position_rad
+        _move(rig, position, rest, rate_hz)  # a joint without weight stays where it was left
+        position = rig.wait_until_still(settle_s).position_rad
     error = np.abs(position - rest)
     worst = int(np.argmax(error))
     if error[worst] > servos.rest_tolerance:
@@ -276,8 +267,8 @@ def bring_home(session: Session, servos: Servos, rate_hz: float, settle_s: float
         )
 
 
-def _move(session: Session, position: np.ndarray, rest: np.ndarray, rate_hz: float) -> None:
-    rig, way = session.rig, rest - position
+def _move(rig: Rig, position: np.ndarray, rest: np.ndarray, rate_hz: float) -> None:
+    way = rest - position
     steps = int(np.ceil(np.max(np.abs(way)) / HOME_RAD_S * rate_hz))
     rig.start()
     try:

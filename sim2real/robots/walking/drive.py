@@ -17,15 +17,15 @@ from sim2real.artifacts.identification import Noise
 from sim2real.errors import SafetyStop, UsageError
 from sim2real.graph.base import Base
 from sim2real.identification.model import Channel
-from sim2real.robots.robot import RobotDrive, RobotSensor
+from sim2real.robots.robot import Embedded, RobotDrive, RobotSensor
 from sim2real.robots.servo.servos import approached
-from sim2real.robots.session import Embedded, Session
 from sim2real.types import Array
 
 if TYPE_CHECKING:
     from sim2real.hardware.device import Device, Reading
     from sim2real.hardware.safety.gate import GateConfig
     from sim2real.hardware.safety.limits import GateLimits
+    from sim2real.hardware.safety.rig import Rig
 
 
 @pytree.dataclass
@@ -210,16 +210,12 @@ class WalkingDrive(RobotDrive):
         self._motors, self._stand_up = motors, stand_up or StandUp()
         self.message: Callable[[Any], LegCommand] = partial(leg_command, kp=gains[0], kd=gains[1])
 
-    @property
-    def embedded(self) -> Embedded | None:
-        return self._emulated("floor")
-
-    def _emulated(self, place: Place) -> Embedded | None:
+    def embedded(self, hanging: bool = False) -> Embedded | None:
         motors = self._motors
-        return motors.embedded(place) if motors is not None and motors.embedded is not None else None
+        return motors.embedded("stand" if hanging else "floor") if motors and motors.embedded else None
 
-    def connect(self, port: str, limits: GateLimits, truth_path: Path, seed: int, hanging: bool = False) -> Session:
-        motors, place = self._motors, "stand" if hanging else "floor"
+    def device(self, port: str, silence_s: float, embedded: bool) -> Device:
+        motors = self._motors
         if motors is None:
             raise UsageError(
                 f"this robot has no device for port {port!r}",
@@ -228,14 +224,10 @@ class WalkingDrive(RobotDrive):
         from sim2real.hardware.registry import load_device
 
         make = load_device(motors.device)
+        return make(port, range(len(self._joints)), motors.settings, baud_rate=0, silence_s=silence_s)
 
-        def device(port: str) -> Device:
-            return make(port, range(len(self._joints)), motors.settings, baud_rate=0, silence_s=limits.servo_watchdog_s)
-
-        return Session(port, device, self._gate(limits, device(port)), self._emulated(place), truth_path, seed)
-
-    def prepare(self, session: Session, settle_s: float) -> None:
-        session.rig.wait_until_still(settle_s, _STILL_RAD_S)
+    def prepare(self, rig: Rig, settle_s: float) -> None:
+        rig.wait_until_still(settle_s, _STILL_RAD_S)
 
     def around(self, signal: np.ndarray) -> np.ndarray:
         return signal + self._stance
@@ -246,17 +238,17 @@ class WalkingDrive(RobotDrive):
         folded = self._stance if self._motors is None else np.asarray(self._motors.folded)
         return bent[:, None] * (folded - self._stance)
 
-    def approach(self, session: Session, commands: np.ndarray) -> np.ndarray:
-        hanging = session.rig.wait_until_still(_HANG_S, _STILL_RAD_S)
+    def approach(self, rig: Rig, commands: np.ndarray) -> np.ndarray:
+        hanging = rig.wait_until_still(_HANG_S, _STILL_RAD_S)
         return approached(commands, hanging.position_rad, self.rate_hz)
 
-    def begin(self, session: Session) -> None:
+    def begin(self, rig: Rig) -> None:
         """Let the robot stand up.
 
         Raises:
             SafetyStop: It tips over, or stands in another pose than its stance at the end.
         """
-        rig, motion = session.rig, self._stand_up
+        motion = self._stand_up
         if rig.torque_withheld:
             return
         reading, now_ns = rig.measure(), rig.clock.now_ns
@@ -276,8 +268,10 @@ class WalkingDrive(RobotDrive):
             worst = int(off.argmax())
             raise SafetyStop(f"{self._joints[worst]} is {off[worst]:.2g} rad off the stance after standing up")
 
-    def _gate(self, limits: GateLimits, device: Device) -> GateConfig:
+    def gate(self, limits: GateLimits, device: Device | None = None) -> GateConfig:
         """Return the gate: a range for each target, and limits of the other columns."""
+        if device is None:
+            return super().gate(limits)
         import mujoco
 
         model: Any = mujoco.MjModel.from_xml_path(str(self._mjcf))  # pyright: ignore[reportAttributeAccessIssue]

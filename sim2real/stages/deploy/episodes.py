@@ -76,7 +76,7 @@ def _measure_delay(bench: Bench, contract: PolicyContract, folder: Path) -> dict
     if config.dry_run or not config.measure_delay or drive.probe is None:
         return {}
     note("waiting for the robot to come to rest, then a few small steps to measure its delay")
-    drive.prepare(bench.session, config.settle_s)
+    drive.prepare(bench.rig, config.settle_s)
     witness = Witness(bench.rig)
     try:
         return check_delay(drive.probe, witness, contract, config)
@@ -92,8 +92,8 @@ def _run_one(bench: Bench, policy: Runner, trial: int, log: Path) -> dict[str, J
         note(f"dry run: the robot is not moved to its start; {length}")
     else:
         note(f"waiting for the robot to come to rest, then {length}")
-        bench.robot.drive.prepare(bench.session, config.settle_s)
-    nodes, params = bench.robot.deployment_nodes(bench.session, policy, trial)
+        bench.robot.drive.prepare(bench.rig, config.settle_s)
+    nodes, params = bench.robot.deployment_nodes(bench.rig, policy, trial)
     return bench.run_episode(nodes, params, log, config.duration_s, "deploy")
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from sim2real.artifacts.files import plain
 from sim2real.artifacts.run import git_state, versions
-from sim2real.errors import ERROR, OK, DeadlineExceeded, SafetyStop, Sim2RealError, UsageError
+from sim2real.errors import ERROR, OK, DeadlineExceeded, SafetyStop, Sim2RealError
 from sim2real.graph.base import GraphState
 from sim2real.graph.episode import MessageRecord, Recorder, StepRecord, named_leaves
 from sim2real.graph.node import BaseNode
@@ -24,7 +24,6 @@ from sim2real.later import jax
 from sim2real.log.writer import McapRecorder
 from sim2real.robots.loop import ACTUATOR, AGENT, ROLES, SENSOR
 from sim2real.robots.robot import Robot
-from sim2real.robots.session import Session
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import MonotonicClock, realtime
 from sim2real.runtime.failure import noted
@@ -90,24 +89,16 @@ def opened(robot: Robot, config: RecordConfig | DeployConfig, truth_path: Path) 
     Args:
         config: Port, limits, seed, and whether it is a dry run.
 
-    Raises:
-        UsageError: The session has no rig, or its device moves in a dry run.
     """
     if config.dry_run:
         note("dry run: torque stays off and no goal is sent; what would have been sent is logged")
     hanging = isinstance(config, RecordConfig) and not config.standing
-    with robot.drive.connect(config.port, config.gate, truth_path, config.seed, hanging) as session, realtime():
-        # Sessions come from plug-ins too: refuse what has no safety gate, no guardian and no dry run.
-        if not isinstance(session.rig, Rig):
-            raise UsageError(
-                f"this robot's session has a {type(session.rig).__name__} for a rig",
-                hint="make its `rig` a sim2real.hardware.safety.rig.Rig of a sim2real.hardware.device.Device",
-            )
+    with robot.drive.connect(config.port, config.gate, truth_path, config.seed, hanging) as rig, realtime():
         if config.dry_run:
-            session.rig.withhold_torque()
-        for line in session.rig.device.without_host() if config.port != "embedded" else ():
+            rig.withhold_torque()
+        for line in rig.device.without_host() if config.port != "embedded" else ():
             note(f"if this process dies: {line}; the guardian takes the torque off", urgent=True)
-        yield Bench(robot, session, config)
+        yield Bench(robot, rig, config)
 
 
 @dataclass(frozen=True)
@@ -115,13 +106,8 @@ class Bench:
     """An open robot with the settings of the stage that opened it."""
 
     robot: Robot
-    session: Session
+    rig: Rig
     config: Any
-
-    @property
-    def rig(self) -> Rig:
-        """The motors behind the safety gate."""
-        return self.session.rig
 
     def run_episode(
         self, nodes: Mapping[str, BaseNode], params: Mapping[str, Any], log: Path, duration_s: float, label: str

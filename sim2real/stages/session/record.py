@@ -48,7 +48,7 @@ def record(robot: AnyRobot, folder: AnyPath, config: RecordConfig | Mapping[str,
         if signal is None:
             bench.rig.withhold_torque()
             note("torque is off: move the robot by hand", urgent=True)
-        nodes = robot.recording_nodes(bench.session, signal, config.standing)
+        nodes = robot.recording_nodes(bench.rig, signal, config.standing)
         bench.run_episode(nodes, {}, log, duration_s, "record")
     return Recording.load(log, truth)
 

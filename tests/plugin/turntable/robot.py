@@ -16,8 +16,7 @@ from sim2real.policy.contract import ActionTerm, ObservationTerm
 from sim2real.robots.agent import AgentParams, GoalAgent
 from sim2real.robots.loop import delay_of
 from sim2real.robots.messages import EpisodeStart, Goals, JointReading
-from sim2real.robots.robot import Robot, RobotAgent, RobotDrive, RobotModel, RobotSensor, RobotTask
-from sim2real.robots.session import Embedded, Session
+from sim2real.robots.robot import Embedded, Robot, RobotAgent, RobotDrive, RobotModel, RobotSensor, RobotTask
 from sim2real.worlds.joint import Forces, JointState, JointWorld
 
 TICK_HZ = 100.0
@@ -84,27 +83,24 @@ class TableDrive(RobotDrive):
 
     rate_hz, command, message, units = 50.0, "goal", Goals, {"goal": "rad/s"}
 
-    @property
-    def embedded(self):
+    def embedded(self, hanging=False):
         from .odrive_emulation import ODriveEmulation
 
         emulator = ODriveEmulation(sensing_latency_s=0.004, actuation_latency_s=0.01)
         return Embedded("turntable.plant:Turntable", emulator)
 
-    def connect(self, port, limits, truth_path, seed, hanging=False):
-        def device(port):
-            from sim2real.hardware.registry import load_device
+    def device(self, port, silence_s, embedded):
+        from sim2real.hardware.registry import load_device
 
-            from .odrive import SpeedLoop
+        from .odrive import SpeedLoop
 
-            silence_s = limits.servo_watchdog_s
-            return load_device("odrive")(port, (0,), SpeedLoop(), baud_rate=115_200, silence_s=silence_s)
+        return load_device("odrive")(port, (0,), SpeedLoop(), baud_rate=115_200, silence_s=silence_s)
 
-        gate = limits.gate(limits.limit, joints=("table",))
-        return Session(port, device, gate, self.embedded, truth_path, seed)
+    def gate(self, limits, device=None):
+        return limits.gate(limits.limit, joints=("table",))
 
-    def prepare(self, session, settle_s):
-        session.rig.wait_until_still(settle_s)
+    def prepare(self, rig, settle_s):
+        rig.wait_until_still(settle_s)
 
 
 class TableAgent(RobotAgent):
