@@ -1,4 +1,4 @@
-"""How a person moves an SO-101 by hand, so that `sim2real new --like so101` can check or make its calibration."""
+"""How a person moves an SO-101 by hand, so that `sim2real new --like so101` can check its calibration."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 from sim2real.hardware.bus.servos import ServoJoint
 from sim2real.hardware.calibration import Nudge
 
-from .robot import JOINTS, SERVOS, TRAVEL_RAD, SO101Robot, calibrations, read
+from .robot import JOINTS, SERVOS, TRAVEL_RAD, SO101Robot, calibrations, find, read
 
 MIDDLE = "upper arm upright, forearm and hand level and forward, jaw half open"
 """The pose in which every joint is in the middle of its travel."""
@@ -29,16 +29,14 @@ def robot(calibration: Path) -> SO101Robot:
     return SO101Robot(calibration=calibration)
 
 
-def calibration_of(joints: tuple[ServoJoint, ...]) -> Path | None:
-    """Return LeRobot's calibration of the arm with these servos; None: there is no calibration at all.
-
-    Of several files, it is the one with the homing offsets of the servos.
+def calibration_of(joints: tuple[ServoJoint, ...]) -> Path:
+    """Return LeRobot's calibration of the arm with these servos: of several files, that with their homing offsets.
 
     Raises:
-        UsageError: The file is refused; see `read`.
+        UsageError: There is none, or it is refused; see `read`.
     """
     paths = calibrations()[1]
     if len(paths) < 2:
-        return paths[0] if paths else None
+        return find()
     offsets = [joint.homing_offset for joint in joints]
     return next((p for p in paths if [joint.homing_offset for joint in read(p)] == offsets), paths[0])

@@ -85,8 +85,8 @@ class NewConfig:
     drive: Literal["position", "velocity", "torque", "duty", "mit"] = "position"
     """Command of the drives, if there is no log."""
     like: Annotated[str | None, Flag("PIPELINE")] = None
-    """Instead of a model: the pipeline of a robot like this one. Checks or makes the calibration of the robot on
-    --port, then records and identifies it."""
+    """Instead of a model: the pipeline of a robot like this one. Checks the calibration of the robot on --port,
+    then records and identifies it."""
     port: Annotated[str | None, Flag("PORT")] = None
     """Serial port of the robot, for --like."""
     folder: Path = Path("pipelines")
@@ -171,7 +171,7 @@ def _check_name(name: str, example: str) -> None:
 
 
 def _run_like(config: NewConfig, like: str) -> bool:
-    """Check or make the calibration, write the pipeline, record, identify, and open the page.
+    """Check the calibration, write the pipeline, record, identify, and open the page.
 
     Returns:
         Whether the identification was accepted.
@@ -221,38 +221,32 @@ def _run_like(config: NewConfig, like: str) -> bool:
 
 
 def calibrate(port: str, guide: Any, path: Path) -> None:
-    """Write the checked calibration of the arm on a port into a file.
-
-    With a calibration of LeRobot's, a person's motion checks it; without one, the motion makes it.
+    """Write LeRobot's calibration of the arm on a port into a file, once a person's motion has checked it.
 
     Args:
         guide: The module ``guide`` of the robot's pipeline.
 
     Raises:
-        UsageError: LeRobot's file is refused.
+        UsageError: There is no calibration, or it is refused.
         HardwareLost: A servo or the motion contradicts the calibration. No motor has moved.
     """
     from sim2real.hardware.bus.port import BusConfig
-    from sim2real.hardware.calibration import HandMotion, find_servos, follow, write_calibration
+    from sim2real.hardware.calibration import HandMotion, find_servos, follow
     from sim2real.hardware.feetech import StsServos
     from sim2real.stages.terminal.console import note
 
     # Find the servos, and the file that belongs to them.
     present = find_servos(port, guide.IDS, guide.BAUD_RATE)
     note(f"{len(present)} servos answer on {port}", urgent=True)
-    source: Path | None = guide.calibration_of(present)
-    joints = present if source is None else guide.read(source)
-    note(f"calibration: {source or 'none of LeRobot, so it is made now'}", urgent=True)
+    source: Path = guide.calibration_of(present)
+    joints = guide.read(source)
+    note(f"calibration: {source}", urgent=True)
     # Opening compares models, homing offsets and limits with the calibration, and takes the torque off.
     with StsServos(BusConfig(port, guide.BAUD_RATE, max_silence_s=_SILENCE_S), joints) as servos:
-        motion = HandMotion(joints, guide.NUDGES, calibrated=source is not None)
+        motion = HandMotion(joints, guide.NUDGES)
         note(f"torque is off. Move the arm by hand. Its middle pose: {guide.MIDDLE}", urgent=True)
         follow(servos, motion, lambda words: note(f"- {words}", urgent=True))
-        if source is None:
-            write_calibration(servos, motion, path)
-        else:
-            shutil.copy(source, path)
-    guide.read(path)
+    shutil.copy(source, path)
     note("the calibration fits the arm", urgent=True)
 
 

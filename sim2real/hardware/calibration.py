@@ -47,8 +47,6 @@ _LEAST_OF_TRAVEL: Final = 0.75
 _CALIBRATE: Final = "calibrate again: begin with every joint in the middle, then move each from stop to stop"
 _PERIOD_S: Final = 0.02
 _LONGEST_S: Final = 600.0
-_CENTRE: Final = 2047
-"""Count of the middle of a joint's travel, as in LeRobot."""
 _SCANS: Final = 3
 _PATIENT_S: Final = 0.02  # answers of a USB adapter with a latency timer of 16 ms
 _Count = Annotated[int, msgspec.Meta(ge=0, le=reg.COUNTS_PER_REVOLUTION - 1)]
@@ -215,24 +213,21 @@ class Nudge:
 class HandMotion:
     """A person moves the joints by hand, with torque off: the middle pose, a nudge of each joint, all stops.
 
-    It follows the counts of the encoders, and finds which servo moves which joint, in which direction and how far.
+    It follows the counts of the encoders, and compares with the calibration which servo moves which joint, in which
+    direction and how far.
 
     Args:
-        joints: The robot's joints. Uncalibrated ones have a range of a whole turn and no homing offset.
+        joints: The robot's calibrated joints.
         nudges: The motions, in the order of the instructions.
 
     Attributes:
         instruction: The present instruction.
-        directions: Joint -> sign of its counts in the direction of its angle; complete after the nudges.
-        low: Lowest counts, unwrapped, ``(joints,)``.
-        high: Highest counts, unwrapped, ``(joints,)``.
-        middle: Counts in the middle pose, ``(joints,)``.
     """
 
-    def __init__(self, joints: Sequence[ServoJoint], nudges: Sequence[Nudge], calibrated: bool) -> None:
-        self.joints, self.nudges, self.calibrated = joints, nudges, calibrated
-        self.directions: dict[str, int] = {}
-        self.low = self.high = self.middle = self._counts = self._anchor = self._first = np.zeros(0)
+    def __init__(self, joints: Sequence[ServoJoint], nudges: Sequence[Nudge]) -> None:
+        self.joints, self.nudges = joints, nudges
+        self._nudged: set[str] = set()
+        self._low = self._high = self._counts = self._anchor = self._first = np.zeros(0)
         self._still_s = self._still_since_s = 0.0
         self._place = {joint.name: i for i, joint in enumerate(joints)}
         self._bounded = [nudge for nudge in nudges if nudge.travel_rad is not None]
@@ -246,8 +241,8 @@ class HandMotion:
             HardwareLost: The motion contradicts the calibration, or the assembly of the arm.
         """
         self._unwrap(t_s, counts)
-        if self.middle.size:
-            self.low, self.high = np.minimum(self.low, self._counts), np.maximum(self.high, self._counts)
+        if self._low.size:
+            self._low, self._high = np.minimum(self._low, self._counts), np.maximum(self._high, self._counts)
             self._require_within()
         try:
             self.instruction = next(self._steps)
@@ -261,7 +256,7 @@ class HandMotion:
         while not middle:
             yield "hold the arm with every joint in the middle of its travel, and keep it still for a second"
             middle = self._is_in_the_middle()
-        self.middle = self.low = self.high = self._counts
+        self._low = self._high = self._counts
         # A nudge begins at rest.
         for nudge in self.nudges:
             words = f"{nudge.joint}: {nudge.words}, then back"
@@ -271,7 +266,7 @@ class HandMotion:
             base = self._counts
             while not self._is_nudged(nudge, base):
                 yield words
-        while lacking := [nudge for nudge in self._bounded if not self._has_been_at_both_stops(nudge)]:
+        while lacking := [nudge for nudge in self._bounded if max(self._short_of(nudge)) > _END_RAD]:
             self._require_reached(lacking)
             yield f"move to both stops: {', '.join(nudge.joint for nudge in lacking)}"
         while self._still_s < _SETTLED_S:
@@ -289,7 +284,7 @@ class HandMotion:
         self._still_s = t_s - self._still_since_s
 
     def _is_in_the_middle(self) -> bool:
-        """Whether the pose at rest is the middle: a calibrated arm's has angles near 0, another was moved before."""
+        """Whether the pose at rest is the middle: its angles are near 0."""
         if self._still_s < _SETTLED_S:
             return False
         moved = bool(np.any(np.abs(self._counts - self._first) * reg.RAD_PER_COUNT > _MOVED_RAD))
@@ -297,11 +292,9 @@ class HandMotion:
         wrong = [n.joint for n in self._bounded if abs(angles[n.joint]) > _MIDDLE_RAD]
         wrong.sort(key=self._place.__getitem__)
         # An arm that was not moved yet lies where it was put away.
-        if not moved and (wrong or not self.calibrated):
-            return False
-        if not self.calibrated or not wrong:
+        if not wrong:
             return True
-        if self._still_s < _POSED_S:
+        if not moved or self._still_s < _POSED_S:
             return False
         there = ", ".join(f"{name} {math.degrees(angles[name]):.0f} degrees" for name in wrong)
         raise HardwareLost(
@@ -310,10 +303,10 @@ class HandMotion:
         )
 
     def _is_nudged(self, nudge: Nudge, base: np.ndarray) -> bool:
-        """Whether the joint of the instruction has moved; note its direction."""
+        """Whether the joint of the instruction has moved, in the direction of the calibration."""
         moved = (self._counts - base) * reg.RAD_PER_COUNT
         # A joint that was nudged before is identified: its motion decides nothing.
-        far = [j for i, j in enumerate(self.joints) if j.name not in self.directions and abs(moved[i]) > _MOVED_RAD]
+        far = [j for i, j in enumerate(self.joints) if j.name not in self._nudged and abs(moved[i]) > _MOVED_RAD]
         if not far:
             return False
         if len(far) > 1:
@@ -326,18 +319,18 @@ class HandMotion:
                 hint="two servos have exchanged ids, or another joint was moved: lerobot-setup-motors sets ids",
             )
         sign = int(np.sign(moved[self._place[joint.name]]))
-        if self.calibrated and sign * joint.direction != nudge.direction:
+        if sign * joint.direction != nudge.direction:
             raise HardwareLost(
                 f"{nudge.joint} turned in the other direction than '{nudge.words}': by the calibration its angle "
                 f"{'fell' if nudge.direction > 0 else 'rose'}",
                 hint="its servo is mounted turned, or drive_mode of the calibration is wrong",
             )
-        self.directions[nudge.joint] = sign * nudge.direction
+        self._nudged.add(nudge.joint)
         return True
 
     def _require_within(self) -> None:
         """Refuse a joint that turns beyond its calibrated range."""
-        for nudge in self._bounded if self.calibrated else []:
+        for nudge in self._bounded:
             low, high = self._ends(nudge)
             beyond = -min(self._short_of(nudge))
             if beyond > _END_RAD:
@@ -350,30 +343,23 @@ class HandMotion:
 
     def _require_reached(self, lacking: Sequence[Nudge]) -> None:
         """Refuse a joint that was moved to its stops, rests, and yet is short of its calibrated range."""
-        for nudge in lacking if self.calibrated and self._still_s > _PATIENCE_S else []:
-            if self._share(nudge) >= _LEAST_OF_TRAVEL:
+        for nudge in lacking if self._still_s > _PATIENCE_S else []:
+            low, high = self._ends(nudge)
+            if (high - low) * reg.RAD_PER_COUNT >= _LEAST_OF_TRAVEL * (nudge.travel_rad or math.inf):
                 raise HardwareLost(
                     f"{nudge.joint} stops {math.degrees(max(self._short_of(nudge))):.0f} degrees before the end of its "
                     "calibrated range: its zero is wrong, or it did not reach its stop",
                     hint=f"start again; if it was at both stops, {_CALIBRATE}",
                 )
 
-    def _has_been_at_both_stops(self, nudge: Nudge) -> bool:
-        return max(self._short_of(nudge)) <= _END_RAD if self.calibrated else self._share(nudge) >= _LEAST_OF_TRAVEL
-
     def _ends(self, nudge: Nudge) -> tuple[float, float]:
         i = self._place[nudge.joint]
-        return float(self.low[i]), float(self.high[i])
+        return float(self._low[i]), float(self._high[i])
 
     def _short_of(self, nudge: Nudge) -> tuple[float, float]:
         """Return the distances of the lowest and the highest count from the calibrated ends [rad]."""
         joint, (low, high) = self.joints[self._place[nudge.joint]], self._ends(nudge)
         return (low - joint.low_count) * reg.RAD_PER_COUNT, (joint.high_count - high) * reg.RAD_PER_COUNT
-
-    def _share(self, nudge: Nudge) -> float:
-        """Return which share of its travel a joint has moved through."""
-        low, high = self._ends(nudge)
-        return (high - low) * reg.RAD_PER_COUNT / (nudge.travel_rad or math.inf)
 
 
 def follow(servos: StsServos, motion: HandMotion, show: Callable[[str], None]) -> None:
@@ -396,35 +382,3 @@ def follow(servos: StsServos, motion: HandMotion, show: Callable[[str], None]) -
             return
         clock.sleep(_PERIOD_S)
     raise HardwareLost(f"the arm was not moved as asked within {_LONGEST_S:.0f} s: {printed}")
-
-
-def write_calibration(servos: StsServos, motion: HandMotion, path: Path) -> None:
-    """Write the homing offsets into the servos, and the calibration file.
-
-    A servo's count is 2047 in the middle of its joint's travel; of a joint without stops in the middle pose.
-    """
-    link, entries = servos.link, {}
-    bounded = {nudge.joint for nudge in motion.nudges if nudge.travel_rad is not None}
-    for i, joint in enumerate(motion.joints):
-        # The encoder's count is that of the register and the offset together.
-        old = link.read(joint.servo_id, reg.HOMING_OFFSET)
-        stops = joint.name in bounded
-        middle = (motion.low[i] + motion.high[i]) / 2 if stops else motion.middle[i]
-        turn = reg.COUNTS_PER_REVOLUTION
-        offset = int((round(middle) + old - _CENTRE + turn // 2) % turn - turn // 2)
-        offset = max(offset, reg.HOMING_OFFSET.minimum)
-        half = (motion.high[i] - motion.low[i]) / 2
-        low, high = (round(_CENTRE - half), round(_CENTRE + half)) if stops else (0, turn - 1)
-        # Without the lock the servo keeps the values when its power goes.
-        link.set(joint.servo_id, reg.LOCK, 0)
-        for register, value in ((reg.HOMING_OFFSET, offset), (reg.MIN_POSITION, low), (reg.MAX_POSITION, high)):
-            link.set(joint.servo_id, register, value)
-        link.set(joint.servo_id, reg.LOCK, 1)
-        entries[joint.name] = {
-            "id": joint.servo_id,
-            "drive_mode": int(motion.directions[joint.name] < 0),
-            "homing_offset": offset,
-            "range_min": low,
-            "range_max": high,
-        }
-    path.write_text(json.dumps(entries, indent=2) + "\n", encoding="utf-8")

@@ -1,4 +1,4 @@
-"""A wrong calibration or assembly of an SO-101 is found before a motor moves; without a calibration it is made."""
+"""A wrong calibration or assembly of an SO-101 is found before a motor moves."""
 
 import json
 from pathlib import Path
@@ -10,7 +10,7 @@ from sim2real.commands.new import calibrate
 from sim2real.emulation.bus import VirtualRobot
 from sim2real.emulation.feetech import StsEmulation
 from sim2real.emulation.truth import Kind
-from sim2real.errors import HardwareLost, Sim2RealError
+from sim2real.errors import HardwareLost, Sim2RealError, UsageError
 from sim2real.hardware.device import OperatingMode
 from sim2real.stages.load import load_module, load_robot
 
@@ -92,19 +92,13 @@ def test_a_fault_is_found_before_a_motor_moves(arm, tmp_path, fault):
     assert not (tmp_path / "calibration.json").exists()
 
 
-@pytest.mark.night  # `make test` plays the motion to HandMotion in test_so101_hand_motion.py
-def test_without_a_calibration_the_motion_makes_one(arm, tmp_path, monkeypatch):
-    """Its zeros are those of the arm. Before, the encoders' seam was inside of the joints' travel."""
-    new = arm(emulation={"homing_offset": 1900})
+def test_without_a_calibration_the_tool_that_makes_one_is_named(arm, tmp_path, monkeypatch):
+    new = arm()
     monkeypatch.delenv("SO101_CALIBRATION")
     monkeypatch.setenv("HF_LEROBOT_CALIBRATION", str(tmp_path / "none"))
-    made = tmp_path / "calibration.json"
-    calibrate(new.port, GUIDE, made)
-    for joint, zero in zip(GUIDE.read(made), load_module("so101", "plant").ZERO_COUNTS, strict=True):
-        tolerance = 200 if joint.name == "wrist_roll" else 25
-        assert joint.zero_count + joint.homing_offset == pytest.approx(zero, abs=tolerance)
-        assert joint.direction == 1
-    assert modes(new) <= {OperatingMode.OFF}
+    with pytest.raises(UsageError, match="no calibration in") as told:
+        calibrate(new.port, GUIDE, tmp_path / "calibration.json")
+    assert "lerobot-calibrate" in str(told.value.hint)
 
 
 def test_two_servos_of_one_id_are_refused(arm, tmp_path, monkeypatch):

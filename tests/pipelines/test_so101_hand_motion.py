@@ -1,4 +1,4 @@
-"""The motion that checks or makes an SO-101's calibration, on the counts of its encoders, without waiting for them."""
+"""The motion that checks an SO-101's calibration, on the counts of its encoders, without waiting for them."""
 
 import json
 
@@ -6,25 +6,24 @@ import numpy as np
 import pytest
 import so101_person
 from test_so101_calibration import FAULTS, GOOD, GUIDE, WHOLE_MOTION
-from wrong_arms import RAD_PER_COUNT, ZERO_COUNTS, WrongArm
+from wrong_arms import RAD_PER_COUNT, WrongArm
 
 from sim2real.errors import HardwareLost
-from sim2real.hardware.bus.servos import ServoJoint
 from sim2real.hardware.calibration import HandMotion
 
 PERIOD_S, PATIENCE_S, OFFSET = 0.02, 8.0, 85
 
 
-def moved(folder, joints, calibrated, offset=OFFSET, **faults):
-    """Show the whole motion of a person to a motion by hand; return it, and whether it is complete."""
+def moved(folder, joints, **faults):
+    """Show the whole motion of a person to a motion by hand; return whether it is complete."""
     end_s = so101_person.write_motion(folder / "hand.npz")
-    arm, motion = WrongArm(folder / "hand.npz", **faults), HandMotion(joints, GUIDE.NUDGES, calibrated)
+    arm, motion = WrongArm(folder / "hand.npz", **faults), HandMotion(joints, GUIDE.NUDGES)
     for t_s in np.arange(0.0, end_s + PATIENCE_S, PERIOD_S):
         arm.advance(t_s)
         angles = np.array([arm.measure(joint.servo_id)[0] for joint in joints])
-        if motion.feed(t_s, (np.round(angles / RAD_PER_COUNT) - offset) % 4096):
-            return motion, True
-    return motion, False
+        if motion.feed(t_s, (np.round(angles / RAD_PER_COUNT) - OFFSET) % 4096):
+            return True
+    return False
 
 
 def calibration(folder, changes):
@@ -38,22 +37,8 @@ def calibration(folder, changes):
 def test_a_fault_contradicts_the_motion(tmp_path, fault):
     plant, changes, _, message = FAULTS[fault]
     with pytest.raises(HardwareLost, match=f"(?s){message}"):
-        moved(tmp_path, calibration(tmp_path, changes), True, **plant)
+        moved(tmp_path, calibration(tmp_path, changes), **plant)
 
 
 def test_a_right_calibration_and_a_whole_motion_fit(tmp_path):
-    motion, complete = moved(tmp_path, calibration(tmp_path, {}), True)
-    assert complete
-    assert set(motion.directions.values()) == {1}
-
-
-def test_without_a_calibration_the_middle_between_the_stops_is_the_zero(tmp_path):
-    """The encoders' seam is inside of the joints' travel."""
-    joints = tuple(ServoJoint(name, entry["id"]) for name, entry in GOOD.items())
-    motion, complete = moved(tmp_path, joints, False, offset=1900)
-    assert complete
-    assert set(motion.directions.values()) == {1}
-    stops = np.array([nudge.travel_rad is not None for nudge in GUIDE.NUDGES])
-    zero = ((motion.low + motion.high) / 2 + 1900 - ZERO_COUNTS + 2048) % 4096 - 2048
-    order = [list(GOOD).index(nudge.joint) for nudge in GUIDE.NUDGES]
-    assert np.abs(zero[order][stops]).max() < 25
+    assert moved(tmp_path, calibration(tmp_path, {}))
