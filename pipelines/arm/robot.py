@@ -53,6 +53,8 @@ def embedded() -> Embedded:
     """Return the emulated arm, with latencies that no stage reads."""
     from sim2real.emulation.dynamixel import EmulatorConfig
 
+    from .plant import ArmPlant
+
     emulator = EmulatorConfig(
         sensing_latency_s=0.006,
         sensing_jitter_s=0.001,
@@ -60,7 +62,7 @@ def embedded() -> Embedded:
         actuation_jitter_s=0.002,
         reply_loss=0.001,
     )
-    return Embedded(f"{Path(__file__).with_name('plant.py')}:ArmPlant", emulator)
+    return Embedded(ArmPlant, emulator)
 
 
 def tip_of(position: Array) -> Any:

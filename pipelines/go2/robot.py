@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 
@@ -13,7 +14,7 @@ from sim2real.robots.walking.drive import LegMotors, Place
 from sim2real.robots.walking.robot import ComposedRobot
 from sim2real.robots.walking.task import Moment, Term
 
-from .plant import LEGS, LYING, PARTS, latencies
+from .plant import LEGS, LYING, PARTS, Go2Body, latencies
 
 _BENT = (2.0, 0.5, 0.5) * 4
 """Weights of hip, thigh and calf off the stance."""
@@ -28,8 +29,8 @@ def embedded(place: Place) -> Embedded:
     """Return the emulated Go2, lying on the floor or in a stand, with parameters and latencies that no stage reads."""
     from sim2real.emulation.legs import UnitreeEmulation
 
-    seed, file = 37, Path(__file__).with_name("plant.py")
-    return Embedded(f"{file}:Go2Body", UnitreeEmulation(*latencies(seed)), {"place": place, "seed": seed})
+    seed = 37
+    return Embedded(partial(Go2Body, place, seed), UnitreeEmulation(*latencies(seed)))
 
 
 class Go2(ComposedRobot):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -83,6 +82,8 @@ class HingeDrive(RobotDrive):
     def embedded(self, hanging: bool = False) -> Embedded:
         from sim2real.emulation.dynamixel import EmulatorConfig
 
+        from .plant import PendulumPlant
+
         emulator = EmulatorConfig(
             sensing_latency_s=0.020,
             sensing_jitter_s=0.003,
@@ -91,7 +92,7 @@ class HingeDrive(RobotDrive):
             reply_loss=0.002,
             model_number=1190,  # an XL330-M077, for 5 V: it continues to turn if its host dies
         )
-        return Embedded(f"{Path(__file__).with_name('plant.py')}:PendulumPlant", emulator)
+        return Embedded(PendulumPlant, emulator)
 
     def device(self, port: str, silence_s: float, embedded: bool) -> DynamixelServos:
         from sim2real.hardware.bus.port import BusConfig

@@ -112,6 +112,8 @@ def embedded() -> Embedded:
     """Return the emulated arm, with latencies that no stage reads."""
     from sim2real.emulation.feetech import StsEmulation
 
+    from .plant import SO101Plant
+
     draw = random.Random("an SO-101 of its own")
     emulator = StsEmulation(
         sensing_latency_s=draw.uniform(0.004, 0.008),
@@ -121,7 +123,7 @@ def embedded() -> Embedded:
         reply_loss=0.001,
         homing_offset=85,
     )
-    return Embedded(f"{Path(__file__).with_name('plant.py')}:SO101Plant", emulator)
+    return Embedded(SO101Plant, emulator)
 
 
 def calibrated(embedded: bool, calibration: Path | None = None) -> StsDrive:

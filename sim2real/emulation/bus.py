@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Final, Protocol, TypeVar
 
-from sim2real.emulation.plant import Plant, PlantClock, load_plant
+from sim2real.emulation.plant import Plant, PlantClock
 from sim2real.emulation.robot import NUMBERS, Emulation, PlannedRobot, VirtualChannel, VirtualTime
 from sim2real.emulation.truth import Kind, TruthLog
 from sim2real.errors import HardwareLost
@@ -50,7 +50,7 @@ class BusEmulation(Emulation):
     unplugged_after_s: float | None = None
 
     def robot(self, physics: Plant, truth_path: Path | None) -> VirtualRobot:
-        return VirtualRobot(physics, self, truth_path=truth_path)
+        return VirtualRobot(physics, self, truth_path)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -293,24 +293,14 @@ class PlannedBus(PlannedRobot[B]):
 class VirtualRobot(VirtualTime):
     """Emulated servos at `port`, from construction until `stop`.
 
-    Args:
-        plant: The plant, or its name; see `load_plant`.
-        plant_args: Keyword arguments of a plant that is named.
-
     Attributes:
         port: The address, which `open_port` knows.
         bus: The emulated bus.
     """
 
-    def __init__(
-        self,
-        plant: str | Plant,
-        config: BusEmulation,
-        plant_args: Mapping[str, Any] | None = None,
-        truth_path: Path | None = None,
-    ) -> None:
-        self.plant = load_plant(plant, plant_args) if isinstance(plant, str) else plant
-        super().__init__(self.plant, config, truth_path)
+    def __init__(self, plant: Plant, config: BusEmulation, truth_path: Path | None = None) -> None:
+        self.plant: Any = plant
+        super().__init__(plant, config, truth_path)
         self._baud_rate: int | None = None  # None: no host has opened the port
         self._inbox: list[bytes] = []
         self.bus: Any = self.planned

@@ -6,7 +6,7 @@ Fill in `make_device` in a test module of your own; pytest runs the rest:
 
     class TestMyServos(DeviceConformance):
         emulation = MyEmulation
-        plant = "my_robot/plant.py:Plant"
+        plant = MyPlant
 
         def make_device(self, port):
             return MyServos(port, ids=(1, 2))
@@ -26,6 +26,7 @@ import numpy as np
 import pytest
 
 from sim2real.emulation.bus import BusEmulation, VirtualRobot
+from sim2real.emulation.plant import Plant
 from sim2real.emulation.robot import VirtualTime
 from sim2real.emulation.truth import Kind
 from sim2real.errors import HardwareLost, SafetyStop
@@ -42,8 +43,7 @@ class DeviceConformance(ABC):
 
     Attributes:
         emulation: The class of the emulator's settings.
-        plant: ``module:Name`` or ``file.py:Name`` of a plant with the device's motors; see ``load_plant``.
-        plant_args: Keyword arguments of the plant.
+        plant: Makes a plant with the device's motors.
         settings: Settings of the emulator that the device needs, e.g. a model.
         patience_s: Time in which a motor must be in the safe state after its host has died [s].
         safe_modes: Modes of a motor in the safe state.
@@ -52,8 +52,7 @@ class DeviceConformance(ABC):
     """
 
     emulation: ClassVar[type[BusEmulation]]
-    plant: ClassVar[str]
-    plant_args: ClassVar[Mapping[str, Any]] = {}
+    plant: ClassVar[type[Plant]]
     settings: ClassVar[Mapping[str, Any]] = {}
     patience_s: ClassVar[float] = 1.0
     safe_modes: ClassVar[frozenset[int]] = frozenset({OperatingMode.OFF})
@@ -67,7 +66,7 @@ class DeviceConformance(ABC):
     def make_robot(self, truth_path: Path, **settings: Any) -> VirtualTime:
         """Return the emulator, started: latencies and faults have the names of `emulation.robot.Emulation`."""
         config = self.emulation(**{**self.settings, **settings})
-        return VirtualRobot(self.plant, config, self.plant_args, truth_path)
+        return VirtualRobot(self.plant(), config, truth_path)
 
     def gate(self, device: Device) -> GateConfig:
         """Return a gate that lets the command at rest pass; with columns: the whole reach."""

@@ -2,7 +2,7 @@
 
 import heapq
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, Final, Protocol, runtime_checkable
 
 import numpy as np
@@ -11,7 +11,6 @@ from sim2real.emulation.truth import Kind, TruthLog
 from sim2real.errors import UsageError
 from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.joint import Joint
-from sim2real.hardware.registry import load_named
 
 STATE_PERIOD_S: Final = 0.005
 
@@ -206,18 +205,6 @@ class PlantClock:
         if self._index % self._state_stride == 0:
             t_ns = self._start_ns + self._index * self._step_ns
             self._truth.write(Kind.STATE, 0, 0, t_ns, t_ns, 0, tuple(plant.state().values()))
-
-
-def load_plant(spec: str, arguments: Mapping[str, Any] | None = None) -> Plant:
-    """Make the plant that a command line names.
-
-    Args:
-        spec: `package.module:Name` or `path/to/file.py:Name`; calling `Name` must return the plant.
-
-    Raises:
-        UsageError: The module, the file or the name does not exist.
-    """
-    return load_named(spec, "plant")(**(arguments or {}))
 
 
 class MountedPlant:

@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import importlib
-import importlib.util
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
-from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Any, Final, Protocol, cast
 
 from sim2real.errors import UsageError
@@ -75,7 +71,8 @@ def load_entry(what: str, name: str, group: str, contract: str) -> Callable[...,
         )
     source = entries[name]
     if isinstance(source, str):
-        return load_named(source, what)
+        module, _, attribute = source.partition(":")
+        return getattr(importlib.import_module(module), attribute)
     # Import it.
     try:
         factory = source.load()
@@ -87,42 +84,3 @@ def load_entry(what: str, name: str, group: str, contract: str) -> Callable[...,
             hint=f"see sim2real.{contract}",
         )
     return factory
-
-
-def load_named(spec: str, what: str) -> Callable[..., Any]:
-    """Return the callable that a command line names as `package.module:Name` or `path/to/file.py:Name`.
-
-    Args:
-        what: The noun for it in errors, e.g. ``plant``.
-
-    Raises:
-        UsageError: The module, the file or the name does not exist, or it cannot be called.
-    """
-    place, _, name = spec.rpartition(":")
-    if not place or not name:
-        hint = f"e.g. my_robot/{what}.py:{what.title()}"
-        raise UsageError(f"{what} {spec!r} is not of the form MODULE_OR_FILE:NAME", hint=hint)
-    module = _load_module(place, what)
-    target: Callable[..., Any] | None = getattr(module, name, None)
-    if not callable(target):
-        available = [key for key, value in vars(module).items() if callable(value) and not key.startswith("_")]
-        raise UsageError(f"{place} has no callable {name!r}. Available: {available}")
-    return target
-
-
-def _load_module(place: str, what: str) -> ModuleType:
-    path = Path(place)
-    if path.suffix == ".py":
-        module_spec = importlib.util.spec_from_file_location(f"_sim2real_{what}_{path.stem}", path)
-        if not path.is_file() or module_spec is None or module_spec.loader is None:
-            raise UsageError(f"there is no {what} file {path}")
-        module = importlib.util.module_from_spec(module_spec)
-        sys.modules[module.__name__] = module  # dataclasses look up their module there
-        module_spec.loader.exec_module(module)
-        return module
-    try:
-        return importlib.import_module(place)
-    except ModuleNotFoundError as error:
-        raise UsageError(
-            f"{what} module {place!r} cannot be imported: {error}", hint="a file's path must end in .py"
-        ) from error

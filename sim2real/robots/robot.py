@@ -12,7 +12,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Self, TypeVar, Unpack
@@ -71,14 +71,12 @@ class Embedded:
     """An emulated robot, used for the port ``embedded``.
 
     Attributes:
-        plant: ``package.module:Name`` or ``path/to/file.py:Name``; see ``load_plant``.
+        plant: Returns its physics: a ``Plant`` or a ``Body`` of ``sim2real.emulation.plant``.
         emulator: Latencies and faults; its seed is replaced by that of the stage.
-        plant_args: Keyword arguments of the plant.
     """
 
-    plant: str
+    plant: Callable[[], Any]
     emulator: Emulation
-    plant_args: Mapping[str, Any] = field(default_factory=dict)
 
     def start(self, truth_path: Path, seed: int, joints: Sequence[Joint] = (), zero_rad: float = 0.0) -> VirtualTime:
         """Return the running robot.
@@ -88,9 +86,9 @@ class Embedded:
             joints: Its mounted joints, in the order of the plant's ``servo_ids``.
             zero_rad: Reading of an encoder, from count 0, at the device's 0 [rad].
         """
-        from sim2real.emulation.plant import MountedPlant, load_plant
+        from sim2real.emulation.plant import MountedPlant
 
-        plant: Any = load_plant(self.plant, self.plant_args)
+        plant = self.plant()
         if not all(joint.is_plain for joint in joints):
             plant = MountedPlant(plant, joints, zero_rad)
         truth_path.parent.mkdir(parents=True, exist_ok=True)

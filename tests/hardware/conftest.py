@@ -1,5 +1,6 @@
+import plants
 import pytest
-from virtual_bus import PLANTS, VirtualBus
+from virtual_bus import VirtualBus
 
 from sim2real.emulation.bus import VirtualRobot
 from sim2real.emulation.dynamixel import EmulatorConfig
@@ -14,7 +15,7 @@ def start_robot(tmp_path):
 
     def start(plant="FirstOrder", config=None, **plant_args):
         path = tmp_path / f"truth{len(robots)}.bin"
-        robots.append(VirtualRobot(f"{PLANTS}:{plant}", config or EmulatorConfig(), plant_args, path))
+        robots.append(VirtualRobot(getattr(plants, plant)(**plant_args), config or EmulatorConfig(), path))
         return robots[-1]
 
     yield start

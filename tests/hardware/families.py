@@ -3,10 +3,10 @@
 import importlib.util
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+import plants
 from turntable import odrive
 from turntable.odrive_emulation import ODriveEmulation
 from turntable.plant import Turntable
@@ -25,7 +25,6 @@ from sim2real.hardware.feetech import StsServos
 from sim2real.hardware.safety.gate import GateConfig
 from sim2real.hardware.safety.rig import Rig
 
-PLANTS = Path(__file__).parent / "plants.py"
 IDS = (1, 2, 3)
 
 
@@ -44,7 +43,7 @@ class Family:
     def robot(self, plant: str = "", settings: Mapping[str, Any] | None = None, **plant_args: Any) -> VirtualRobot:
         """Return an emulated robot, on which the torque is off."""
         config = self.emulation(**(settings or {}))
-        return VirtualRobot(f"{PLANTS}:{plant or self.plant}", config, {"ids": list(IDS), **plant_args})
+        return VirtualRobot(getattr(plants, plant or self.plant)(**{"ids": list(IDS), **plant_args}), config)
 
     def device(self, robot: VirtualRobot, **limits: Any) -> Device:
         return self.make(robot.port, **limits)

@@ -1,9 +1,10 @@
 """Every device here fulfils the contract of a device, on its emulator in virtual time."""
 
 import pytest
-from families import PLANTS
+from plants import FirstOrder, Joints
 from turntable.odrive import ODrive, SpeedLoop
 from turntable.odrive_emulation import ODriveEmulation
+from turntable.plant import Turntable
 
 from pipelines.go2.plant import Go2Body
 from sim2real.emulation.conformance import DeviceConformance
@@ -17,7 +18,7 @@ from sim2real.hardware.feetech import StsServos
 
 class TestOneServoByVoltage(DeviceConformance):
     emulation = EmulatorConfig
-    plant = f"{PLANTS}:FirstOrder"
+    plant = FirstOrder
 
     def make_device(self, port):
         # Patient with lost answers, which are many here.
@@ -26,7 +27,7 @@ class TestOneServoByVoltage(DeviceConformance):
 
 class TestThreeServosByAngle(DeviceConformance):
     emulation = EmulatorConfig
-    plant = f"{PLANTS}:Joints"
+    plant = Joints
 
     def make_device(self, port):
         bus = BusConfig(port, max_silence_s=0.5, silence_s=0.6)
@@ -35,7 +36,7 @@ class TestThreeServosByAngle(DeviceConformance):
 
 class TestFeetech(DeviceConformance):
     emulation = StsEmulation
-    plant = f"{PLANTS}:Joints"
+    plant = Joints
 
     def make_device(self, port):
         joints = [ServoJoint(f"joint{i}", i) for i in (1, 2, 3)]
@@ -46,7 +47,7 @@ class TestODrive(DeviceConformance):
     """The plug-in's own tests are these, in the package that is installed: tests/process/test_plugin.py."""
 
     emulation = ODriveEmulation
-    plant = "turntable.plant:Turntable"
+    plant = Turntable
 
     def make_device(self, port):
         return ODrive(port, (0,), SpeedLoop(), baud_rate=115_200, silence_s=0.6)

@@ -4,11 +4,9 @@ import subprocess
 import sys
 
 import pytest
-from virtual_bus import PLANTS
 
-from sim2real.emulation.plant import load_plant
 from sim2real.emulation.truth import Kind, TruthLog, read_truth
-from sim2real.errors import Sim2RealError, UsageError
+from sim2real.errors import Sim2RealError
 
 
 def test_the_account_of_a_robot_can_be_cut_anywhere(start_robot, tmp_path):
@@ -38,23 +36,6 @@ def test_an_emulator_needs_neither_jax_nor_mujoco():
         "print([m for m in ('jax', 'mujoco', 'serial', 'sim2real.graph', 'sim2real.log') if m in sys.modules])"
     )
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"
-
-
-def test_plants_may_be_dataclasses():
-    assert load_plant(f"{PLANTS}:Still", {"servo_ids": (3,)}).servo_ids == (3,)
-
-
-@pytest.mark.parametrize(
-    ("spec", "message"),
-    [
-        ("plants.py", "MODULE_OR_FILE:NAME"),
-        ("none.py:Plant", "no plant file"),
-        ("no_such_module:P", "cannot be imported"),
-    ],
-)
-def test_plants_that_cannot_be_found(spec, message):
-    with pytest.raises(UsageError, match=message):
-        load_plant(spec)
 
 
 def test_a_truth_that_cannot_be_written_does_not_stop_the_robot(tmp_path):

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from families import PLANTS
+from plants import Joints
 
 from sim2real.emulation.bus import BusEmulation
 from sim2real.emulation.conformance import DeviceConformance
@@ -59,7 +59,7 @@ class AcmeEmulation(BusEmulation):
 
 
 class TestAcme(DeviceConformance):
-    emulation, plant = AcmeEmulation, f"{PLANTS}:Joints"
+    emulation, plant = AcmeEmulation, Joints
 
     def make_device(self, port):
         return AcmeServos(BusConfig(port, max_silence_s=0.5, silence_s=0.6), (1, 2, 3), AcmeDrive())

@@ -19,7 +19,7 @@ FACTORS = {"gain": 0.87, "damping": 0.252 / 0.23, "armature": 1.25, "friction": 
 def arguments():
     """What the arm's robot hands to a twin."""
     robot = load_robot("arm")
-    return robot.model.twin(robot.drive.embedded().emulator, **FACTORS).plant_args
+    return robot.model.twin(robot.drive.embedded().emulator, **FACTORS).plant.keywords
 
 
 @pytest.fixture

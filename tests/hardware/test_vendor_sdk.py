@@ -2,7 +2,7 @@
 
 import pytest
 from dynamixel_sdk import GroupSyncRead, GroupSyncWrite, PacketHandler, PortHandler
-from virtual_bus import PLANTS
+from plants import FirstOrder
 
 from sim2real.emulation.bus import VirtualRobot
 from sim2real.emulation.dynamixel import EmulatorConfig
@@ -70,7 +70,7 @@ class Sdk:
 
 @pytest.fixture
 def sdk():
-    robot = VirtualRobot(f"{PLANTS}:FirstOrder", EmulatorConfig(), {"ids": [1, 2, 5]})
+    robot = VirtualRobot(FirstOrder([1, 2, 5]), EmulatorConfig())
     yield Sdk(robot)
     robot.stop()
 

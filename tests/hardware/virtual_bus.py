@@ -1,19 +1,17 @@
 from functools import cached_property
-from pathlib import Path
 
-from sim2real.emulation.plant import load_plant
+import plants
+
 from sim2real.emulation.robot import Emulation, PlannedRobot, VirtualTime, truth_header
 from sim2real.emulation.truth import TruthLog, read_truth
 from sim2real.hardware.device import Device
-
-PLANTS = Path(__file__).parent / "plants.py"
 
 
 class VirtualBus:
     """An emulated bus in virtual time: no process, no waiting, every instant exact."""
 
     def __init__(self, path, plant, config, **plant_args):
-        self.plant = load_plant(f"{PLANTS}:{plant}", plant_args)
+        self.plant = getattr(plants, plant)(**plant_args)
         self.now_ns = 0
         self.sent = []
         self._path = path

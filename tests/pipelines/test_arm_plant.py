@@ -1,16 +1,15 @@
 """The embedded arm against statics, kinematics and energy written down by hand."""
 
-import functools
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from sim2real.emulation.plant import load_plant
 from sim2real.hardware.device import OperatingMode
+from sim2real.stages.load import load_module
 
 FILE = Path(__file__).resolve().parents[2] / "pipelines" / "arm" / "plant.py"
-ArmPlant = functools.partial(load_plant, f"{FILE}:ArmPlant")  # as the emulator gets it
+ArmPlant = load_module("arm", "plant").ArmPlant
 SMOOTH = {"coulomb": (0.0, 0.0, 0.0)}
 OFF, POSITION, PWM = OperatingMode.OFF, OperatingMode.POSITION, OperatingMode.PWM
 PAN, SHOULDER, ELBOW = 1, 2, 3
@@ -69,7 +68,7 @@ def trajectory(plant, duration_s):
 @pytest.mark.parametrize("goal", [(0.4, 0.9, -0.6), (-1.2, 1.3, 1.0), (0.0, -1.2, 0.3)])
 def test_it_droops_until_torques_balance(goal):
     for factors, friction in (({}, STATIC), (SMOOTH, np.zeros(3))):
-        plant = command(ArmPlant(factors), POSITION, goal)
+        plant = command(ArmPlant(**factors), POSITION, goal)
         plant.advance(3.0)
         q, gain = plant.data.qpos, plant.truth()["gain"]
         # Goal and angle are rounded to counts, so that the error is known to one of them.
@@ -138,7 +137,7 @@ def test_torque_on_does_not_jump():
 
 @pytest.mark.parametrize("factors", [{}, SMOOTH], ids=["rough", "smooth"])
 def test_energy_goes_into_friction(factors):
-    plant = command(at(ArmPlant(factors), 0, 1.4, -0.5), OFF, (0, 0, 0))
+    plant = command(at(ArmPlant(**factors), 0, 1.4, -0.5), OFF, (0, 0, 0))
     states = trajectory(plant, 1.0)
     total, speed = energy(states), np.abs(states[:, 3:])
     level = 0.0 if factors else FRICTION * (1 + 0.2 * np.exp(-speed / 0.1))
@@ -151,7 +150,7 @@ def test_the_motor_brakes_only_while_torque_is_on():
     """At a duty of 0 the winding is shorted and the back-EMF brakes; with torque off it is open."""
     inertia = pan_inertia(0, 0)
     for mode, damping in ((PWM, BACK_EMF + VISCOUS), (OFF, VISCOUS)):
-        plant = command(ArmPlant(SMOOTH), mode, (0, 0, 0))
+        plant = command(ArmPlant(**SMOOTH), mode, (0, 0, 0))
         plant.data.qvel[0] = 1.0
         assert trajectory(plant, 0.0205)[-1, 3] == pytest.approx(np.exp(-damping * 0.02 / inertia), rel=0.02)
 
@@ -165,7 +164,7 @@ def test_the_stops_hold():
 def test_configure_changes_the_gain():
     droops = []
     for p_gain in (800, 1600):
-        plant = ArmPlant(SMOOTH)
+        plant = ArmPlant(**SMOOTH)
         for servo_id in plant.servo_ids:
             plant.configure(servo_id, p_gain, 0, np.inf)
         command(plant, POSITION, (0, 1.2, 0)).advance(3.0)

@@ -92,7 +92,7 @@ def test_a_recording_moves_the_legs_in_a_stand(tmp_path):
     assert (np.abs(sent[1] - measured[0]) < 0.1).all()
     assert (np.ptp(sent, axis=0) > 0.2).all()
     assert (np.ptp(measured, axis=0) > 0.1).all()
-    assert ROBOT.drive.embedded().plant_args["place"] == "floor"
+    assert ROBOT.drive.embedded().plant.args[0] == "floor"
 
 
 @pytest.mark.night

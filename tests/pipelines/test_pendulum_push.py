@@ -1,9 +1,7 @@
 """A pendulum that friction holds upright is pushed over, under the gate's limits, in virtual time."""
 
-from pathlib import Path
-from types import SimpleNamespace
-
 import pytest
+from plants import FirstOrder
 
 from sim2real.emulation.bus import VirtualRobot
 from sim2real.emulation.dynamixel import EmulatorConfig
@@ -15,7 +13,6 @@ from sim2real.hardware.safety.gate import GateConfig
 from sim2real.hardware.safety.rig import Rig
 from sim2real.stages.load import load_robot
 
-PLANT = f"{Path(__file__).parents[1] / 'hardware' / 'plants.py'}:FirstOrder"
 """It turns at 1.8 rad/s under the push, and stays where it is without torque."""
 
 
@@ -28,9 +25,9 @@ PLANT = f"{Path(__file__).parents[1] / 'hardware' / 'plants.py'}:FirstOrder"
     ],
 )
 def test_a_push_is_measured_and_its_reason_is_kept(gate, noun):
-    robot = VirtualRobot(PLANT, EmulatorConfig(), {"ids": [1]})
+    robot = VirtualRobot(FirstOrder(), EmulatorConfig())
     device = DynamixelServos(BusConfig(robot.port, silence_s=1.0), [1], VoltageDrive(5.0))
     with Rig(device, GateConfig(2.0, **gate)) as rig:
         with pytest.raises(SafetyStop, match=noun):
-            load_robot("pendulum").drive.prepare(SimpleNamespace(rig=rig), 2.0)
+            load_robot("pendulum").drive.prepare(rig, 2.0)
         assert robot.bus.servos[1].get(reg.TORQUE_ENABLE) == 0

@@ -1,10 +1,10 @@
 """A wrong calibration or assembly of an SO-101 is found before a motor moves."""
 
 import json
-from pathlib import Path
 
 import pytest
 import so101_person
+from wrong_arms import WrongArm
 
 from sim2real.commands.new import calibrate
 from sim2real.emulation.bus import VirtualRobot
@@ -16,7 +16,6 @@ from sim2real.stages.load import load_module, load_robot
 
 SO101 = load_robot("so101")
 GUIDE = load_module("so101", "guide")
-PLANT = f"{Path(__file__).with_name('wrong_arms.py')}:WrongArm"
 GOOD = json.loads((SO101.folder / "calibration.json").read_text())
 
 
@@ -32,7 +31,7 @@ def arm(tmp_path, monkeypatch):
         monkeypatch.setenv("SO101_CALIBRATION", str(file))
         settings = {"homing_offset": 85, "plant_step_s": 0.001} | (emulation or {})
         truth = tmp_path / "truth.bin"
-        arms.append(VirtualRobot(PLANT, StsEmulation(**settings), {"hand": str(hand)} | plant, truth))
+        arms.append(VirtualRobot(WrongArm(hand, **plant), StsEmulation(**settings), truth))
         return arms[-1]
 
     yield start

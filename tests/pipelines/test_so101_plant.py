@@ -1,6 +1,5 @@
 """The embedded SO-101 against statics by hand: it droops, sticks, sinks to the table, and is folded again."""
 
-import functools
 import subprocess
 import sys
 from pathlib import Path
@@ -8,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim2real.emulation.plant import load_plant
 from sim2real.hardware.device import OperatingMode
+from sim2real.stages.load import load_module
 
 FILE = Path(__file__).resolve().parents[2] / "pipelines" / "so101" / "plant.py"
-SO101Plant = functools.partial(load_plant, f"{FILE}:SO101Plant")  # as the emulator gets it
+SO101Plant = load_module("so101", "plant").SO101Plant
 OFF, POSITION = OperatingMode.OFF, OperatingMode.POSITION
 COUNT, G, GAIN = 2 * np.pi / 4096, 9.81, 6.53
 ZERO = np.array([2133, 2118, 2154, 2127, 2133, 2098]) * COUNT
@@ -109,9 +108,8 @@ def test_it_is_measured_in_the_encoders_angle():
 
 def test_it_imports_no_jax():
     code = f"""
-import sys
-from sim2real.emulation.plant import load_plant
-load_plant({str(FILE) + ":SO101Plant"!r})
+import runpy, sys
+runpy.run_path({str(FILE)!r})["SO101Plant"]()
 sys.exit("jax" in sys.modules)
 """
     assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0

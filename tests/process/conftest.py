@@ -3,18 +3,22 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from emulator import EmulatedProcess
 
 from sim2real.stages.load import load_robot
 
+ROOT = Path(__file__).parents[2]
+
 
 @pytest.fixture
 def lone_robot(tmp_path):
     """An emulated pendulum that does not end with its host."""
     embedded = load_robot("pendulum").drive.embedded()
-    with EmulatedProcess(embedded.plant, embedded.emulator, {}, tmp_path / "truth.bin") as robot:
+    plant = f"{ROOT / 'pipelines/pendulum/plant.py'}:PendulumPlant"
+    with EmulatedProcess(plant, embedded.emulator, {}, tmp_path / "truth.bin") as robot:
         yield robot
 
 

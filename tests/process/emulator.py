@@ -8,8 +8,10 @@ prints one line of JSON with the port when it is ready, and runs until SIGTERM.
 
 import ctypes
 import gc
+import importlib
 import json
 import os
+import runpy
 import select
 import signal
 import socket
@@ -22,10 +24,8 @@ from dataclasses import asdict
 from pathlib import Path
 
 from sim2real.emulation.bus import BusEmulation
-from sim2real.emulation.plant import load_plant
 from sim2real.emulation.robot import truth_header
 from sim2real.emulation.truth import TruthLog, read_truth
-from sim2real.hardware.registry import load_named
 
 
 class EmulatedProcess:
@@ -148,11 +148,16 @@ def keep_time():
     gc.disable()
 
 
+def load(spec):
+    """Return what ``package.module:Name`` or ``path/to/file.py:Name`` names."""
+    place, _, name = spec.rpartition(":")
+    return runpy.run_path(place)[name] if place.endswith(".py") else getattr(importlib.import_module(place), name)
+
+
 def main(task):
     ends = []
     signal.signal(signal.SIGTERM, lambda *_: ends.append(True))
-    config = load_named(task["emulation"], "emulation")(**task["settings"])
-    plant = load_plant(task["plant"], task["plant_args"])
+    config, plant = load(task["emulation"])(**task["settings"]), load(task["plant"])(**task["plant_args"])
     connection = Pty() if isinstance(config, BusEmulation) else Dds()
     keep_time()
     start_ns = time.monotonic_ns()

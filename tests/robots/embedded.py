@@ -35,7 +35,7 @@ class Arm:
     def robot(self, seed, plant=None, **faults):
         embedded = self.drive.embedded()
         emulator = replace(embedded.emulator, seed=seed, **faults)
-        return VirtualRobot(embedded.plant, emulator, {**embedded.plant_args, **(plant or {})})
+        return VirtualRobot(embedded.plant(**(plant or {})), emulator)
 
     def device(self, robot, limits):
         return self.drive.device(robot.port, limits.servo_watchdog_s, embedded=True)
@@ -110,7 +110,7 @@ class Pendulum(Arm):
 
     def robot(self, seed, plant=None, **faults):
         embedded = self.drive.embedded()
-        return VirtualRobot(embedded.plant, replace(embedded.emulator, seed=seed, **faults), plant)
+        return VirtualRobot(embedded.plant(**(plant or {})), replace(embedded.emulator, seed=seed, **faults))
 
     def device(self, robot, limits):
         return self.drive.device(robot.port, limits.servo_watchdog_s, embedded=True)

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sim2real.emulation.plant import load_plant
 from sim2real.errors import Sim2RealError
 from sim2real.hardware.device import OperatingMode
 from sim2real.robots.probe import delays_of
@@ -97,7 +96,7 @@ def answers_of(plant, step, mode, settings=()):
 def test_the_lag_of_a_robot_holds_at_half_and_at_twice_its_friction(name, arguments, mode, settings):
     """It was one number, measured on the embedded robot, and decided on the real one."""
     drive = load_robot(name).drive
-    plant = load_plant(drive.embedded().plant, arguments)
+    plant = drive.embedded().plant(**arguments)
     step = drive.probe.step if mode == POSITION else drive.probe.step / 5.0
     found = replace(delays_of(answers_of(plant, step, mode, settings)), lag_s=drive.probe.lag_s)
     assert found.between_s[0] - 0.001 <= 0.03 <= found.between_s[1] + 0.001

@@ -116,15 +116,13 @@ def play(arm: HiddenArm, robot: Any, act: Act, seconds: float, session: int) -> 
     from sim2real.emulation.plant import PlantClock
     from sim2real.hardware.device import OperatingMode
     from sim2real.hardware.dynamixel import RAD_PER_COUNT, RAD_S_PER_COUNT
-    from sim2real.hardware.registry import load_named
     from sim2real.robots.messages import JointReading
+    from sim2real.stages.load import load_module
 
     servos = robot.drive.servos
     more = {"start": servos.at_rest.tolist()} if arm.name == "so101" else {}
     kind = {"arm": "ArmPlant", "so101": "SO101Plant"}[arm.name]
-    plant = load_named(f"{Path(robot.model.mjcf).with_name('plant.py')}:{kind}", "plant")(
-        **arm.plant, carried_kg=arm.load_kg, **more
-    )
+    plant = getattr(load_module(arm.name, "plant"), kind)(**arm.plant, carried_kg=arm.load_kg, **more)
     zero = np.array([plant.measure(i)[0] for i in servos.ids])
     zero -= [plant.state()[f"position[{j}]"] for j in range(len(servos.ids))]
     # Draw all times first: computation, ages of measurements, delays of commands.

@@ -35,17 +35,15 @@ def record(
     from sim2real.emulation.legs import EmulatedLegs, UnitreeEmulation
     from sim2real.emulation.robot import truth_header
     from sim2real.emulation.truth import TruthLog
-    from sim2real.hardware.registry import load_named
     from sim2real.robots.servo.servos import approached
-    from sim2real.stages.load import load_robot
+    from sim2real.stages.load import load_module, load_robot
     from sim2real.stages.session.excitation import excitation
 
     pipeline = load_robot("go2")
     robot: Any = pipeline
-    plant = load_named(f"{Path(robot.mjcf).with_name('plant.py')}:Go2Body", "plant")
-    drawn = load_named(f"{Path(robot.mjcf).with_name('plant.py')}:latencies", "plant")
-    sensing_s, acting_s, jitter_s = latencies_s or drawn(seed)
-    body = plant("floor" if standing else "stand", seed)
+    plant = load_module("go2", "plant")
+    sensing_s, acting_s, jitter_s = latencies_s or plant.latencies(seed)
+    body = plant.Go2Body("floor" if standing else "stand", seed)
     config = UnitreeEmulation(sensing_s, acting_s, jitter_s, seed=seed)
     truth = TruthLog(path.with_suffix(".truth.bin"), truth_header(body, config, 0))
     legs = EmulatedLegs(body, config, truth, 0)

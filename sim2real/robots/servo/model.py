@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
@@ -214,7 +214,7 @@ class ServoModel(RobotModel):
             "static": [friction * g if worn else 0.0 for g in s.gears],
             "stribeck_rad_s": [(sheet.stribeck_rad_s or 1.0) / g for g in s.gears],
         }
-        arguments = {
+        arguments: dict[str, Any] = {
             "mjcf": self.mjcf.read_text(encoding="utf-8"),
             "joints": s.names,
             "servo_ids": s.ids,
@@ -223,8 +223,10 @@ class ServoModel(RobotModel):
             "names": [p.name for p in self.dynamics() if p.name != PAYLOAD],
             "gears": s.gears,
         }
-        emulator = replace(emulator, model_number=sheet.model_number)
-        return Embedded("sim2real.emulation.servo_plant:ServoPlant", emulator, arguments)
+        from sim2real.emulation.servo_plant import ServoPlant
+
+        plant = partial(ServoPlant, **arguments)
+        return Embedded(plant, replace(emulator, model_number=sheet.model_number))
 
     @cached_property
     def model(self) -> MjModel:

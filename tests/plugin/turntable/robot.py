@@ -85,9 +85,10 @@ class TableDrive(RobotDrive):
 
     def embedded(self, hanging=False):
         from .odrive_emulation import ODriveEmulation
+        from .plant import Turntable
 
         emulator = ODriveEmulation(sensing_latency_s=0.004, actuation_latency_s=0.01)
-        return Embedded("turntable.plant:Turntable", emulator)
+        return Embedded(Turntable, emulator)
 
     def device(self, port, silence_s, embedded):
         from sim2real.hardware.registry import load_device
