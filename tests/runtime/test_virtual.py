@@ -5,28 +5,16 @@ import threading
 import jax
 import pytest
 from asynchronous_nodes import Plain, pair
+from virtual_clock import VirtualClock
 
 from sim2real.errors import Sim2RealError
 from sim2real.runtime import virtual
 from sim2real.runtime.asynchronous import AsyncGraph
-from sim2real.runtime.virtual import VirtualClock
-
-
-class Robot:
-    """A robot whose time is all that it has."""
-
-    ns = 10**9
-
-    def now_ns(self):
-        return self.ns
-
-    def sleep(self, duration_s):
-        self.ns += round(1e9 * duration_s)
 
 
 @pytest.fixture
 def clock(monkeypatch):
-    monkeypatch.setattr(Plain, "clock", VirtualClock(Robot()))
+    monkeypatch.setattr(Plain, "clock", VirtualClock())
     return Plain.clock
 
 

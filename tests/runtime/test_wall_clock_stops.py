@@ -34,8 +34,8 @@ def clock(monkeypatch):
 
 
 def graph_threads():
-    """The threads of this test's graphs: all that the clock does not know from before."""
-    return [t.name for t in Plain.clock.taking_part() if t.name.startswith("sim2real:")]
+    """The running threads of this test's graphs."""
+    return [t.name for t in Plain.clock.running if t.name.startswith("sim2real:")]
 
 
 def gone(clock):
@@ -45,7 +45,7 @@ def gone(clock):
 
 def in_thread(call, *args):
     thread = threading.Thread(target=call, args=args)
-    thread.start()
+    Plain.clock.start(thread)
     return thread
 
 

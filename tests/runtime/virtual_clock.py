@@ -1,124 +1,39 @@
-"""Virtual time for graphs on the wall clock: it jumps to the next deadline when every thread waits."""
+"""A clock of graphs whose time passes only while every thread waits: that of emulated robots, without a robot."""
 
-import threading
-
-from sim2real.runtime.clock import MonotonicClock
+from sim2real.runtime import virtual
 
 
-class VirtualClock(MonotonicClock):
-    """A clock that shows the time of the wall clock's threads without letting it pass.
+class Time:
+    """Time that is nothing else."""
 
-    All threads that exist while a test runs take part, except those that existed before. Computing takes no time:
-    only ``sleep`` and waiting do.
-    """
+    ns = 1_000_000_000_000
+
+    def now_ns(self):
+        return self.ns
+
+    def sleep(self, duration_s):
+        self.ns += round(1e9 * duration_s)
+
+
+class VirtualClock(virtual.VirtualClock):
+    """A virtual clock that knows which of the threads that it started run."""
 
     def __init__(self):
-        self._ns = 1_000_000_000_000
-        self._lock = threading.RLock()
-        self._waiting = {}  # thread -> (predicate, deadline [ns], what wakes it)
-        self._others = set(threading.enumerate()) - {threading.current_thread()}
-        super().__init__()
-
-    def monotonic_ns(self):
-        return self._ns
-
-    def keep_time(self):
-        """Take no priority: these threads keep no time."""
+        self.running = set()
+        super().__init__(Time())
 
     def sleep(self, seconds):
         self.wait_for(lambda: False, seconds)
 
-    def wait_for(self, predicate, timeout_s=None):
-        """Wait until a predicate is true; return whether it became so before the timeout."""
-        me = threading.current_thread()
-        with self._lock:
-            deadline = float("inf") if timeout_s is None else self.monotonic_ns() + round(1e9 * max(0.0, timeout_s))
-            wake = threading.Condition(self._lock)
-            self._waiting[me] = predicate, deadline, wake
+    def start(self, thread):
+        run = thread.run
+
+        def counted():
             try:
-                while not (found := predicate()) and self.monotonic_ns() < deadline:
-                    if not self._jump():
-                        wake.wait(0.001)  # a thread that ends wakes nobody
-                return bool(found)
+                run()
             finally:
-                del self._waiting[me]
+                self.running.discard(thread)
 
-    def event(self):
-        return _Event(self)
-
-    def condition(self):
-        return _Condition(self)
-
-    def lock(self):
-        return _Lock(self)
-
-    def taking_part(self):
-        """Return the threads for which time waits."""
-        return set(threading.enumerate()) - self._others
-
-    def _jump(self):
-        """Go to the next deadline if all threads wait for one; return whether the time has changed."""
-        taking_part = self.taking_part()
-        if not taking_part <= self._waiting.keys():
-            return False
-        deadline = min(deadline for _, deadline, _ in self._waiting.values())
-        if deadline <= self.monotonic_ns() or any(predicate() for predicate, *_ in self._waiting.values()):
-            return False
-        assert deadline < float("inf"), f"all wait for ever: {[t.name for t in taking_part]}"
-        self._go_to(deadline)
-        self._wake()
-        return True
-
-    def _wake(self):
-        """Wake the threads whose time has come; the others would only look and wait on."""
-        for predicate, deadline, wake in self._waiting.values():
-            if deadline <= self.monotonic_ns() or predicate():
-                wake.notify()
-
-    def _go_to(self, deadline):
-        self._ns = deadline
-
-
-class _Condition:
-    def __init__(self, clock):
-        self._clock = clock
-        self.wait_for = clock.wait_for
-        self.notify = self.notify_all = lambda n=1: clock._wake()
-
-    def __enter__(self):
-        return self._clock._lock.__enter__()
-
-    def __exit__(self, *error):
-        return self._clock._lock.__exit__(*error)
-
-
-class _Event(_Condition):
-    def __init__(self, clock):
-        super().__init__(clock)
-        self._flag = False
-
-    def is_set(self):
-        return self._flag
-
-    def set(self):
-        with self:
-            self._flag = True
-            self.notify_all()
-
-    def wait(self, timeout=None):
-        return self.wait_for(self.is_set, timeout)
-
-
-class _Lock:
-    def __init__(self, clock):
-        self._clock, self._held = clock, False
-
-    def __enter__(self):
-        with self._clock._lock:
-            self._clock.wait_for(lambda: not self._held)
-            self._held = True
-
-    def __exit__(self, *error):
-        with self._clock._lock:
-            self._held = False
-            self._clock._wake()
+        thread.run = counted
+        self.running.add(thread)
+        super().start(thread)
