@@ -39,7 +39,7 @@ class BusEmulation(Emulation):
     """
 
     bus_type: ClassVar[Callable[..., PlannedBus[Any]]]
-    """Makes the bus from plant, settings, truth, ``send``, ``start_ns`` and ``now_ns``."""
+    """Makes the bus from plant, settings, truth and ``send``."""
 
     baud_rate: int = 1_000_000
     sensing_jitter_s: float = 0.0
@@ -123,7 +123,6 @@ class PlannedBus(PlannedRobot[B]):
 
     Args:
         send: Delivers the bytes of an answer to the host; returns False if the host cannot take them.
-        start_ns: Time 0 of the plant.
         servos: Id -> firmware, ordered by id.
     """
 
@@ -133,18 +132,16 @@ class PlannedBus(PlannedRobot[B]):
         config: B,
         truth: TruthLog,
         send: Callable[[bytes], bool],
-        start_ns: int,
-        now_ns: Callable[[], int],
         parser: PacketParser,
         servos: Mapping[int, Firmware],
     ) -> None:
-        super().__init__(config, truth, start_ns)
-        self._send, self._now_ns = send, now_ns
+        super().__init__(config, truth)
+        self._send = send
         self.random = random.Random(config.seed)
         self._byte_ns = 1e10 / config.baud_rate
         # The plant, with a history as long as the sensing latency.
         history_s = config.sensing_latency_s + config.sensing_jitter_s
-        self._clock = PlantClock(plant, round(config.plant_step_s * 1e9), start_ns, round(history_s * 1e9), truth)
+        self._clock = PlantClock(plant, round(config.plant_step_s * 1e9), round(history_s * 1e9), truth)
         self._firmware = servos
         self._controllers: dict[int, tuple[int, int, float]] = {}
         for servo in servos.values():
@@ -152,11 +149,11 @@ class PlannedBus(PlannedRobot[B]):
         self._last_effect_ns = dict.fromkeys(servos, 0)
         # The state of the wire: its bytes, faults and events.
         self._parser = parser
-        self._wire_free_ns = self._last_bytes_ns = self._delivered_ns = start_ns
+        self._wire_free_ns = self._last_bytes_ns = self._delivered_ns = 0
         self._frozen: dict[int, tuple[float, float, float]] = {}
         self._events: list[tuple[int, int, Callable[..., None], tuple[Any, ...]]] = []
         self._sequence = 0
-        self.begin_faults(start_ns)
+        self.begin_faults(0)
 
     @property
     def baud_rate(self) -> int:
@@ -243,7 +240,7 @@ class PlannedBus(PlannedRobot[B]):
         reported = values
         if self.has(config.frozen_after_s, t_ns):
             reported = self._frozen.setdefault(servo.servo_id, (values[0], 0.0, values[2]))
-        servo.refresh(*reported, tick_ms=(t_ns - self.start_ns) // 1_000_000)
+        servo.refresh(*reported, tick_ms=t_ns // 1_000_000)
         return sampled_ns, values
 
     def reply(
@@ -274,8 +271,7 @@ class PlannedBus(PlannedRobot[B]):
         lost = self.is_silent(planned_ns) or self.random.random() < self.config.reply_loss
         if lost or not self._send(answer):
             kind = Kind.LOSS
-        now_ns = self._now_ns()
-        self.truth.write(kind, servo_id, request.t_host_ns, t_ns, now_ns, now_ns - planned_ns, values)
+        self.truth.write(kind, servo_id, request.t_host_ns, t_ns, planned_ns, 0, values)
 
     def _trip_watchdog(self, servo: Firmware, t_ns: int) -> None:
         self.measure(servo, t_ns)
@@ -308,7 +304,7 @@ class VirtualRobot(VirtualTime):
         EMULATED[self.port] = self._open
 
     def make(self, physics: Plant, config: BusEmulation, log: TruthLog) -> PlannedRobot[Any]:
-        return config.bus_type(physics, config, log, self._take, 0, self.now_ns)
+        return config.bus_type(physics, config, log, self._take)
 
     def stop(self) -> None:
         EMULATED.pop(self.port, None)

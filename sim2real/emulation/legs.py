@@ -7,7 +7,6 @@ sensing latency earlier.
 from __future__ import annotations
 
 import random
-import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -68,7 +67,6 @@ class EmulatedLegs(PlannedRobot[UnitreeEmulation]):
     """Motors and IMU of a body.
 
     Args:
-        start_ns: Time 0 of the body.
         send: Sends a state; None: nobody gets any.
 
     Attributes:
@@ -80,12 +78,10 @@ class EmulatedLegs(PlannedRobot[UnitreeEmulation]):
         body: Body,
         config: UnitreeEmulation,
         truth: TruthLog,
-        start_ns: int,
         send: Callable[[LowState], object] | None = None,
-        now_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        super().__init__(config, truth, start_ns)
-        self._body, self._send, self._clock_ns = body, send, now_ns
+        super().__init__(config, truth)
+        self._body, self._send = body, send
         self._rng, self._random = np.random.default_rng(config.seed), random.Random(config.seed)
         self._step_ns = round(1e9 * body.step_s)
         self._index = 0
@@ -96,7 +92,7 @@ class EmulatedLegs(PlannedRobot[UnitreeEmulation]):
         self.ignored = 0
         # States that wait to be sent, until when they are held up, and when the next one is due.
         self._waiting: deque[tuple[LowState, int]] = deque()
-        self._held_ns, self._due_ns = 0, start_ns + _PERIOD_NS
+        self._held_ns, self._due_ns = 0, _PERIOD_NS
         # Measurements on the grid of the physics, the newest last, as far back as a state reaches.
         self._dtype = body.measure().dtype
         depth = int(1e9 * config.sensing_latency_s) // self._step_ns + 3
@@ -157,7 +153,7 @@ class EmulatedLegs(PlannedRobot[UnitreeEmulation]):
         message, n = LowState(), self._body.motors
         record, motors, imu = message.record, message.record["motor_state"][:n], message.record["imu_state"]
         record["head"], record["level_flag"] = HEAD, LOW_LEVEL
-        record["tick"] = (t_ns - self.start_ns) // 1_000_000 % (1 << 32)
+        record["tick"] = t_ns // 1_000_000 % (1 << 32)
         motors["mode"], motors["tau_est"], motors["temperature"] = self._modes, measured["tau_est"], 35
         motors["q"] = measured["q"] + config.position_noise_rad * draw(size=n)
         motors["dq"] = measured["dq"] + config.velocity_noise_rad_s * draw(size=n)
@@ -186,8 +182,8 @@ class EmulatedLegs(PlannedRobot[UnitreeEmulation]):
             lost = chance() < config.reply_loss
             if not lost and self._send is not None:
                 self._send(state)
-            done_ns, sampled_ns = self._clock_ns(), sent_ns - round(1e9 * config.sensing_latency_s)
-            self.truth.write(Kind.LOSS if lost else Kind.SAMPLE, 0, sent_ns, sampled_ns, done_ns, done_ns - sent_ns)
+            sampled_ns = sent_ns - round(1e9 * config.sensing_latency_s)
+            self.truth.write(Kind.LOSS if lost else Kind.SAMPLE, 0, sent_ns, sampled_ns, state_ns, state_ns - sent_ns)
 
     def _apply(self, effect_ns: int, t_ns: int, modes: np.ndarray, law: np.ndarray) -> None:
         """Let a command act. A motor that is off has no torque; Unitree's two numbers take a controller out."""
@@ -218,7 +214,7 @@ class EmulatedLegs(PlannedRobot[UnitreeEmulation]):
         self.truth.write(Kind.WATCHDOG, 0, self._heard_ns or 0, now_ns, now_ns, 0)
 
     def _now_ns(self) -> int:
-        return self.start_ns + self._index * self._step_ns
+        return self._index * self._step_ns
 
     def _remember(self) -> None:
         self._history.append(self._body.measure().reshape(1).view(np.float64))
@@ -259,7 +255,7 @@ class VirtualLegs(VirtualTime):
         EMULATED[self.address] = lambda mark: VirtualLink(self, mark)
 
     def make(self, physics: Body, config: UnitreeEmulation, log: TruthLog) -> PlannedRobot[Any]:
-        return EmulatedLegs(physics, config, log, 0, self._publish, self.now_ns)
+        return EmulatedLegs(physics, config, log, self._publish)
 
     def stop(self) -> None:
         EMULATED.pop(self.address, None)

@@ -124,14 +124,12 @@ class PlantClock:
     Args:
         plant: The mechanism; must be at time 0.
         step_ns: Spacing of the grid [ns].
-        start_ns: Time of the grid's first point, CLOCK_MONOTONIC [ns].
         history_ns: How far back from the newest grid point `sample` must reach [ns].
     """
 
-    def __init__(self, plant: Plant, step_ns: int, start_ns: int, history_ns: int, truth: TruthLog) -> None:
+    def __init__(self, plant: Plant, step_ns: int, history_ns: int, truth: TruthLog) -> None:
         self._plant = plant
         self._step_ns = step_ns
-        self._start_ns = start_ns
         self._truth = truth
         self._index = 0
         self._effects: list[tuple[int, int, int, int, int, int, float]] = []
@@ -143,7 +141,7 @@ class PlantClock:
 
     def advance(self, t_ns: int) -> None:
         """Step the plant to the last grid point at or before `t_ns`."""
-        target = (t_ns - self._start_ns) // self._step_ns
+        target = t_ns // self._step_ns
         while self._index < target:
             while self._effects and self._effects[0][0] <= self._index:
                 self._apply()
@@ -163,7 +161,7 @@ class PlantClock:
             t_ns: Time of its effect [ns].
             t_host_ns: Time at which the emulator received it, for the truth log [ns]; 0: a command of the servo itself.
         """
-        index = max(round((t_ns - self._start_ns) / self._step_ns), self._index)
+        index = max(round(t_ns / self._step_ns), self._index)
         self._sequence += 1
         heapq.heappush(self._effects, (index, self._sequence, t_ns, t_host_ns, servo_id, mode, goal))
 
@@ -178,7 +176,7 @@ class PlantClock:
         Interpolated linearly between grid points; after the newest one the position is extrapolated by the velocity.
         """
         # Find the grid point before, within the history.
-        place = max(0.0, (t_ns - self._start_ns) / self._step_ns)
+        place = max(0.0, t_ns / self._step_ns)
         before = min(int(place), self._index)
         before = max(before, self._index - self._depth + 2)
         position_rad, velocity_rad_s, load = self._history[before % self._depth][servo_id]
@@ -195,7 +193,7 @@ class PlantClock:
 
     def _apply(self) -> None:
         _, _, planned_ns, t_host_ns, servo_id, mode, goal = heapq.heappop(self._effects)
-        t_ns = self._start_ns + self._index * self._step_ns
+        t_ns = self._index * self._step_ns
         self._plant.command(servo_id, mode, goal)
         self._truth.write(Kind.EFFECT, servo_id, t_host_ns, t_ns, t_ns, t_ns - planned_ns, (mode, goal))
 
@@ -203,7 +201,7 @@ class PlantClock:
         plant = self._plant
         self._history[self._index % self._depth] = {i: plant.measure(i) for i in plant.servo_ids}
         if self._index % self._state_stride == 0:
-            t_ns = self._start_ns + self._index * self._step_ns
+            t_ns = self._index * self._step_ns
             self._truth.write(Kind.STATE, 0, 0, t_ns, t_ns, 0, tuple(plant.state().values()))
 
 

@@ -93,10 +93,10 @@ class Physics(Protocol):
         ...
 
 
-def truth_header(physics: Physics, config: Emulation, start_ns: int) -> dict[str, Any]:
-    """Return the header of a truth file; ``start_ns`` is time 0 of the physics."""
+def truth_header(physics: Physics, config: Emulation) -> dict[str, Any]:
+    """Return the header of a truth file."""
     facts = {"servo_ids": list(getattr(physics, "servo_ids", ())), "state_names": list(physics.state())}
-    return {"start_ns": start_ns, "config": asdict(config), **facts, "truth": physics.truth()}
+    return {"config": asdict(config), **facts, "truth": physics.truth()}
 
 
 C = TypeVar("C", bound=Emulation)
@@ -110,9 +110,8 @@ class PlannedRobot(ABC, Generic[C]):
         faulty_ns: Time from which the times of faults count [ns].
     """
 
-    def __init__(self, config: C, truth: TruthLog, start_ns: int) -> None:
-        self.config, self.truth, self.start_ns = config, truth, start_ns
-        self.faulty_ns = start_ns
+    def __init__(self, config: C, truth: TruthLog) -> None:
+        self.config, self.truth, self.faulty_ns = config, truth, 0
 
     @abstractmethod
     def next_due_ns(self) -> int | None:
@@ -159,7 +158,7 @@ class VirtualTime(ABC):
         self._watchers: dict[threading.Event, list[Any]] = {}  # what is called, its period [ns], when it is due [ns]
         self._calling = False
         self._guard: Guard | None = None
-        self._log = TruthLog(self.truth_path, truth_header(physics, config, 0))
+        self._log = TruthLog(self.truth_path, truth_header(physics, config))
         self.planned = self.make(physics, config, self._log)
 
     @abstractmethod

@@ -7,7 +7,6 @@ error, and has no watchdog. A family overrides what its firmware does differentl
 from __future__ import annotations
 
 import math
-import time
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import ClassVar, Final, Generic, TypeVar
@@ -202,8 +201,6 @@ class ServoBus(PlannedBus[E], Generic[S, E]):
         config: E,
         truth: TruthLog,
         send: Callable[[bytes], bool],
-        start_ns: int,
-        now_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self.form = self.family.form
         self.servos = {i: self.make_servo(i, config) for i in sorted(plant.servo_ids)}
@@ -215,7 +212,7 @@ class ServoBus(PlannedBus[E], Generic[S, E]):
             Instruction.SYNC_READ: self._sync_read,
             Instruction.SYNC_WRITE: self._sync_write,
         }
-        super().__init__(plant, config, truth, send, start_ns, now_ns, Parser(self.form), self.servos)
+        super().__init__(plant, config, truth, send, Parser(self.form), self.servos)
 
     @abstractmethod
     def make_servo(self, servo_id: int, config: E) -> S:

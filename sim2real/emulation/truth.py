@@ -108,7 +108,7 @@ class Truth:
     """A truth file in memory.
 
     Args:
-        header: The emulator's `config`, `servo_ids`, `start_ns`, `state_names`, and the plant's parameters (`truth`).
+        header: The emulator's `config`, `servo_ids`, `state_names`, and the plant's parameters (`truth`).
         rows: Structured array of shape (N,), see `Kind`; `values` has shape (N, V).
     """
 

@@ -15,8 +15,8 @@ class VirtualBus:
         self.now_ns = 0
         self.sent = []
         self._path = path
-        self._log = TruthLog(path, truth_header(self.plant, config, 0))
-        self.bus = type(config).bus_type(self.plant, config, self._log, self._take, 0, lambda: self.now_ns)
+        self._log = TruthLog(path, truth_header(self.plant, config))
+        self.bus = type(config).bus_type(self.plant, config, self._log, self._take)
         self.servos = self.bus.servos
 
     def _take(self, answer):
@@ -72,7 +72,7 @@ class IdleTime(VirtualTime):
         super().__init__(Nothing(), Emulation(), None)
 
     def make(self, physics, config, log):
-        return Idle(config, log, 0)
+        return Idle(config, log)
 
 
 class IdleDevice(Device):

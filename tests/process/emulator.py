@@ -70,8 +70,8 @@ class Pty:
         os.set_blocking(self.fd, False)
         self.port, self.inputs = os.ttyname(self._host_fd), [self.fd]
 
-    def make(self, plant, config, truth, start_ns):
-        return config.bus_type(plant, config, truth, self._send, start_ns, time.monotonic_ns)
+    def make(self, plant, config, truth):
+        return config.bus_type(plant, config, truth, self._send)
 
     def exchange(self, robot, now_ns):
         with suppress(BlockingIOError):
@@ -105,17 +105,17 @@ class Dds:
         self._reader = DataReader(participant, Topic(participant, COMMAND_TOPIC, LowCmd))
         self._write = DataWriter(participant, Topic(participant, STATE_TOPIC, LowState)).write
 
-    def make(self, body, config, truth, start_ns):
+    def make(self, body, config, truth):
         from sim2real.emulation.legs import EmulatedLegs
 
-        return EmulatedLegs(body, config, truth, start_ns, self._write)
+        return EmulatedLegs(body, config, truth, self._write)
 
     def exchange(self, robot, now_ns):
         """Pass the host's commands on; they count from the time at which they were written."""
         for message in self._reader.take(16):
             if hasattr(message, "record") and not robot.is_silent(now_ns):
                 age_ns = time.time_ns() - message.sample_info.source_timestamp
-                robot.receive(message, time.monotonic_ns() - max(0, age_ns))
+                robot.receive(message, now_ns - max(0, age_ns))
 
 
 def free_domain():
@@ -148,6 +148,14 @@ def keep_time():
     gc.disable()
 
 
+class LiveTruth(TruthLog):
+    """A truth whose times are those of CLOCK_MONOTONIC, which all processes of a machine share."""
+
+    def write(self, kind, servo_id, t_host_ns, t_ns, t_done_ns, late_ns, values=()):
+        t_host_ns = t_host_ns and t_host_ns + self.start_ns  # 0: a command of the servo itself
+        super().write(kind, servo_id, t_host_ns, t_ns + self.start_ns, t_done_ns + self.start_ns, late_ns, values)
+
+
 def load(spec):
     """Return what ``package.module:Name`` or ``path/to/file.py:Name`` names."""
     place, _, name = spec.rpartition(":")
@@ -161,18 +169,20 @@ def main(task):
     connection = Pty() if isinstance(config, BusEmulation) else Dds()
     keep_time()
     start_ns = time.monotonic_ns()
-    truth = TruthLog(Path(task["truth"]), truth_header(plant, config, start_ns))
-    robot = connection.make(plant, config, truth, start_ns)
+    now = lambda: time.monotonic_ns() - start_ns  # noqa: E731 - the robot's time
+    truth = LiveTruth(Path(task["truth"]), truth_header(plant, config))
+    truth.start_ns = start_ns
+    robot = connection.make(plant, config, truth)
     print(json.dumps({"port": connection.port}), flush=True)
     flushed_ns = 0
     while not ends:
         # Sleep until the host has sent something, or the next event is due.
-        now_ns = time.monotonic_ns()
+        now_ns = now()
         due_ns = robot.next_due_ns() or now_ns + connection.idle_ns
         wait_ns = min(connection.idle_ns, max(0, due_ns - now_ns))
         select.select(connection.inputs, [], [], 1e-9 * wait_ns)
         # Pass on what was sent, then compute all events up to now.
-        now_ns = time.monotonic_ns()
+        now_ns = now()
         connection.exchange(robot, now_ns)
         robot.run_until(now_ns)
         if now_ns > flushed_ns + 100_000_000:

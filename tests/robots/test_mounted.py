@@ -25,7 +25,9 @@ GEARED = replace(SERVOS, joints=(Joint("left", 0.3, -1, GEARS[0]), Joint("right"
 
 def test_a_twins_servos_are_those_of_the_data_sheet_whatever_their_gears(pair):
     factors = {"gain": 0.9, "damping": 1.1, "armature": 1.2, "friction": 1.5}
-    one, other = (ServoPlant(**r.model.twin(EmulatorConfig(), **factors).plant.keywords) for r in (pair, PairRobot(GEARED)))
+    one, other = (
+        ServoPlant(**r.model.twin(EmulatorConfig(), **factors).plant.keywords) for r in (pair, PairRobot(GEARED))
+    )
     assert other.truth() == pytest.approx(one.truth(), rel=1e-5)
     assert one.truth() == pytest.approx({n: v * factors[n.split("_")[0]] for n, v in pair.nominal().items()}, rel=1e-5)
 

@@ -139,7 +139,7 @@ def play(arm: HiddenArm, robot: Any, act: Act, seconds: float, session: int) -> 
     acts = np.maximum.accumulate(sent + lags)
     # Let the loop run, with the torque on from the start.
     truth = _States(plant)
-    clock = PlantClock(plant, PLANT_STEP_NS, 0, round(1e9 * (arm.sensing + arm.jitter)), truth)  # type: ignore[arg-type]
+    clock = PlantClock(plant, PLANT_STEP_NS, round(1e9 * (arm.sensing + arm.jitter)), truth)  # type: ignore[arg-type]
     mode, readings, goals = int(OperatingMode.POSITION), [], []
     for servo_id, at in zip(servos.ids, zero + servos.at_rest, strict=True):
         clock.configure(servo_id, servos.sheet.p_gain, 0, servos.sheet.profile_rad_s)

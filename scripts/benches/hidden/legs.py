@@ -45,8 +45,8 @@ def record(
     sensing_s, acting_s, jitter_s = latencies_s or plant.latencies(seed)
     body = plant.Go2Body("floor" if standing else "stand", seed)
     config = UnitreeEmulation(sensing_s, acting_s, jitter_s, seed=seed)
-    truth = TruthLog(path.with_suffix(".truth.bin"), truth_header(body, config, 0))
-    legs = EmulatedLegs(body, config, truth, 0)
+    truth = TruthLog(path.with_suffix(".truth.bin"), truth_header(body, config))
+    legs = EmulatedLegs(body, config, truth)
     # Let the legs hang, then plan the way to the excitation from there; or let the robot stand up.
     if standing:
         begin_ns, goals = _stand_up(legs, robot), robot.drive.around(robot.drive.standing(seconds))

@@ -25,9 +25,9 @@ def emulated(tmp_path):
     def make(body=None, **settings):
         body = body or Go2Body("stand")
         config = UnitreeEmulation(**{**SILENT, **settings})
-        truth = TruthLog(tmp_path / "truth.bin", truth_header(body, config, 0))
+        truth = TruthLog(tmp_path / "truth.bin", truth_header(body, config))
         logs.append(truth)
-        return EmulatedLegs(body, config, truth, 0), body, truth
+        return EmulatedLegs(body, config, truth), body, truth
 
     yield make
     for log in logs:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -96,8 +95,6 @@ class Board(PlannedBus["ODriveEmulation"]):
         config: Behaviour of line and board.
         truth: Log of true states and latencies.
         send: Called with an answer's bytes.
-        start_ns: Time 0 of the plant.
-        now_ns: Clock by which lateness is measured.
     """
 
     def __init__(
@@ -106,11 +103,9 @@ class Board(PlannedBus["ODriveEmulation"]):
         config: ODriveEmulation,
         truth: TruthLog,
         send: Callable[[bytes], bool],
-        start_ns: int,
-        now_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self.axis = Axis()
-        super().__init__(plant, config, truth, send, start_ns, now_ns, Lines(), {0: self.axis})
+        super().__init__(plant, config, truth, send, Lines(), {0: self.axis})
 
     def execute(self, request: Request) -> None:
         """Carry out a line; one whose checksum is wrong is ignored, as the board does."""
