@@ -177,11 +177,8 @@ def test_a_robot_that_tips_over_is_stopped_while_it_stands_up():
 
             return SimpleNamespace(position_rad=np.zeros(12), parts={"quaternion": np.array([0.5, 0.87, 0.0, 0.0])})
 
-    class Session:
-        rig = Rig()
-
     with pytest.raises(SafetyStop, match="tipped over"):
-        ROBOT.drive.begin(Session())
+        ROBOT.drive.begin(Rig())
 
 
 def test_identified_values_are_those_of_the_twin():

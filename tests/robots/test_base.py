@@ -11,10 +11,10 @@ from sim2real.robots.robot import PARTS, RecordedRobot, Robot, RobotDrive, check
 class BareDrive(RobotDrive):
     """A drive without data."""
 
-    def connect(self, port, limits, truth_path, seed, hanging=False):
+    def device(self, port, silence_s, embedded):
         """Do nothing."""
 
-    def prepare(self, session, settle_s):
+    def prepare(self, rig, settle_s):
         """Do nothing."""
 
 

@@ -83,9 +83,9 @@ def test_a_simulation_starts_where_the_robot_rested_also_beyond_the_bounds_of_it
 
 def test_a_recording_begins_where_the_joints_are(pair):
     reading = SimpleNamespace(position_rad=np.array([1.0, -0.3]))
-    session = SimpleNamespace(rig=SimpleNamespace(measure=lambda: reading))
+    rig = SimpleNamespace(measure=lambda: reading)
     signal = 0.2 * np.sin(np.arange(100))[:, None] * np.ones(2)
-    agent = pair.recording_nodes(session, signal)["agent"]
+    agent = pair.recording_nodes(rig, signal)["agent"]
     played = np.array([agent.step(SimpleNamespace(seq=k))[1].goal for k in range(100)])
     np.testing.assert_allclose(played[0], reading.position_rad)
     off = np.abs(played - signal)
@@ -97,9 +97,9 @@ def test_a_recording_begins_where_the_joints_are(pair):
 def test_an_excitation_is_around_the_middle_and_waits_where_it_ends():
     robot = PairRobot(replace(SERVOS, middle=(0.3, -0.2)))
     reading = SimpleNamespace(position_rad=np.array([0.3, -0.2]))
-    session = SimpleNamespace(rig=SimpleNamespace(measure=lambda: reading))
+    rig = SimpleNamespace(measure=lambda: reading)
     signal = 0.1 * np.sin(np.arange(40))[:, None] * np.ones(2)
-    agent = robot.recording_nodes(session, signal)["agent"]
+    agent = robot.recording_nodes(rig, signal)["agent"]
     played = np.array([agent.step(SimpleNamespace(seq=k))[1].goal for k in range(60)])
     np.testing.assert_allclose(played[:40], signal + np.array([0.3, -0.2]))
     np.testing.assert_allclose(played[40:], np.tile(played[39], (20, 1)))
