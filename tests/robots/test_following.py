@@ -2,6 +2,7 @@
 
 import importlib.util
 import random
+from dataclasses import replace
 from functools import cache, partial
 
 import pytest
@@ -31,7 +32,8 @@ def sound(name, seed, share, busy=None):
     robot, by_model = robot_of(name), seed % 2 == 0
     plant = {"carried_kg": share * robot.model.hand.most_kg} if share and name in ("arm", "so101") else None
     emulated = robot.robot(seed, {"seed": seed} if name == "go2" else plant)
-    with robot.rig(emulated, by_model or None, robot.limits.on("embedded")) as rig:
+    patient = replace(robot.limits, max_sample_age_s=2.0, servo_watchdog_s=2.0)
+    with robot.rig(emulated, by_model or None, patient) as rig:
         if busy is not None and name != "go2":
             hold_up(emulated, busy)
         stalls = (lambda t_s: None) if busy is None else lambda t_s: emulated.stall(0.3 * max(0.0, busy.uniform(-9, 1)))
@@ -69,7 +71,7 @@ def test_of_400_sound_deployments_none_is_stopped(name, seed):
 def test_a_joint_that_lets_go_is_named_within_half_a_second(name, plant, policy):
     robot = robot_of(name)
     emulated = robot.robot(2, plant, lets_go_after_s=LETS_GO_S, lets_go=robot.id)
-    with robot.rig(emulated, limits=robot.limits.on("embedded")) as rig:
+    with robot.rig(emulated) as rig:
         with pytest.raises(SafetyStop) as stopped:
             drive(emulated, rig, partial(robot.raised, **policy), 4.0)
         assert LETS_GO_S < 1e-9 * rig.clock.now_ns() < LETS_GO_S + 0.5
