@@ -68,7 +68,6 @@ class Replay:
         rmse: Model -> root mean square error; None if the model diverged. ``as in this log`` is fitted to this log.
         expected: Expected error of the identified model, scaled up if this log moves more; None if unknown.
         column: The position's name among the columns.
-        free_run: Mean error of the identified model in free runs over held-out recordings; None without free runs.
     """
 
     name: str
@@ -77,7 +76,6 @@ class Replay:
     rmse: Mapping[str, float | None]
     expected: float | None = None
     column: str = ""
-    free_run: float | None = None
 
 
 _MIN_SHARE = 0.5

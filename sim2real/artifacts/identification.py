@@ -27,7 +27,7 @@ from sim2real.artifacts.timing import TIMING, Timing
 from sim2real.errors import Sim2RealError
 from sim2real.types import Json
 
-FORMAT = 4
+FORMAT = 5
 PARAMETERS, PREDICTIONS, FREE_RUNS, REPLAYS = "parameters.json", "predictions.npz", "free_runs.npz", "replays.npz"
 ROUND_TRIP = "round_trip_delay"
 """Name of the sum of all delays."""
@@ -91,66 +91,6 @@ class Judgement:
     next: str = ""
 
 
-@dataclass(frozen=True)
-class Determined:
-    """Determinacy of the parameters at the estimate.
-
-    Attributes:
-        undetermined: Groups of parameters; the data determines at most combinations of each group.
-        messages: The same in sentences.
-        standard_error_per_minute: Parameter -> expected standard error after one minute of such data.
-    """
-
-    undetermined: tuple[tuple[str, ...], ...]
-    messages: tuple[str, ...]
-    standard_error_per_minute: Mapping[str, float | None]
-
-
-@dataclass(frozen=True)
-class Prediction:
-    """Errors of a model up to a horizon: field -> root mean square error; None without data."""
-
-    model: str
-    horizon_s: float
-    held_out: bool
-    rmse: Mapping[str, float | None]
-
-
-@dataclass(frozen=True)
-class FreeRun:
-    """Errors of one model in one field, with all held-out data of a recording simulated from one initial state."""
-
-    model: str
-    recording: int
-    begin_s: float
-    seconds: float
-    held_out: bool
-    field: str
-    rmse: float | None
-
-
-@dataclass(frozen=True)
-class HeldOutPart:
-    """A fit without one part of the recordings, and its errors on that part.
-
-    Attributes:
-        terms: Optional terms of the model in this fit.
-        values: Parameter -> estimate of this fit.
-        share: Parameter -> share of the information in all recordings that the part holds.
-        ahead: Field -> root mean square error on the part up to the longest horizon.
-        free: Field -> root mean square error of a free run over the part; empty without a free run.
-        run_s: Length of the free run [s]; 0 in older files.
-    """
-
-    name: str
-    terms: tuple[str, ...]
-    values: Mapping[str, Json]
-    share: Mapping[str, float]
-    ahead: Mapping[str, float | None]
-    free: Mapping[str, float | None] = field(default_factory=dict)
-    run_s: float = 0.0
-
-
 _COLUMN = re.compile(r"(.+?)(?:\[(\d+)\])?")
 
 
@@ -188,19 +128,12 @@ class Search:
     """The search for the estimate.
 
     Attributes:
-        history: Best loss of each generation ``(G,)``.
         evaluations: Number of simulated candidates.
-        loss: Best loss of an interrupted search.
-        done: Completed shares of an interrupted search and refinement.
         engine: The simulator, and the reason for its choice.
     """
 
-    strategy: str | None = None
-    history: np.ndarray = field(default_factory=lambda: np.zeros(0))
     evaluations: int = 0
     seconds: float | None = None
-    loss: float | None = None
-    done: Mapping[str, float] = field(default_factory=dict)
     engine: str = ""
 
 
@@ -245,11 +178,9 @@ def tried_table(rows: Sequence[TriedTerm]) -> ArtifactTable:
 
 @dataclass(frozen=True)
 class Quantity:
-    """One quantity, estimated from each of R recordings alone, and the mean of these estimates.
+    """The mean of the estimates of one quantity from each recording alone.
 
     Attributes:
-        estimates: Shape ``(R,)``.
-        standard_errors: Shape ``(R,)``.
         standard_error: Of the mean.
         between: Deviation between recordings, beyond their standard errors.
         low95: Lower end of the 95 % interval for a further recording.
@@ -258,8 +189,6 @@ class Quantity:
 
     name: str
     unit: str
-    estimates: np.ndarray
-    standard_errors: np.ndarray
     mean: float
     standard_error: float
     between: float
@@ -267,13 +196,12 @@ class Quantity:
     high95: float
     agree: bool
 
-    def __post_init__(self) -> None:
-        check(self.estimates.shape == self.standard_errors.shape, f"{self.name}: estimates without errors")
-
 
 ErrorKind = Literal["ahead", "free run"]
 AHEAD: ErrorKind = "ahead"
 FREE_RUN: ErrorKind = "free run"
+HELD_OUT = "held-out data"
+"""The held-out data of all recordings together."""
 MAX_ERROR_RATIO = 1.25
 """Largest ratio of an error to the expected error that does not count as exceeded."""
 
@@ -327,11 +255,6 @@ class ComparedError:
     wider: float = 1.0
     beaten_by: tuple[str, ...] = ()
     baselines: Mapping[str, float | None] = field(default_factory=dict)
-
-    @property
-    def rmse(self) -> dict[str, float | None]:
-        """Model -> its error, ``identified`` first; None if it diverges."""
-        return {"identified": self.error, **self.baselines}
 
     @property
     def ratio(self) -> float | None:
@@ -392,7 +315,6 @@ class WorstSecond:
         begin_s: Start of the second in the recording [s].
         end_s: Its end [s]; a shorter segment has a shorter one.
         rmse: Root mean square of the residual in it; None if the model diverges.
-        times_noise: The same in deviations of a measurement; None if the model diverges.
         of_motion: The same as a share of the motion, the deviation of all measured positions of the joint in the
             recording; None if the model diverges.
     """
@@ -405,7 +327,6 @@ class WorstSecond:
     begin_s: float
     end_s: float
     rmse: float | None
-    times_noise: float | None
     of_motion: float | None
 
     @property
@@ -452,9 +373,6 @@ def worst_window(t_s: np.ndarray, squares: np.ndarray) -> tuple[float, float, fl
     return float(t_s[first[worst]]), float(t_s[after[worst] - 1]), math.sqrt(max(float(means[worst]), 0.0))
 
 
-_LINK_HEADERS = ("link", "estimate", "95 % interval", "unit")
-
-
 @dataclass(frozen=True)
 class Ranged:
     """A number with its 95 % interval; None if the log does not determine it."""
@@ -489,30 +407,23 @@ class Link:
     delays: np.ndarray
     share: np.ndarray
 
-    def rows(self) -> ArtifactTable:
-        """Return a row for each number that the log determines."""
-        total, name = " + ".join(self.parts), self.name
-        numbers = [
-            (f"{total}, mean", self.mean, 1e3, "ms"),
-            (f"{total}, 95 % of the messages", self.p95, 1e3, "ms"),
-            (f"{name}, deviation", self.deviation, 1e3, "ms"),
-            (f"{name}, lost", self.lost, 100.0, "%"),
-        ]
-        rows = [
-            [label, factor * r.value, Interval(_scaled(r.low95, factor), _scaled(r.high95, factor)), unit]
-            for label, r, factor, unit in numbers
-            if r.value is not None
-        ]
-        return ArtifactTable(_LINK_HEADERS, rows)
-
 
 def links_table(links: Sequence[Link]) -> ArtifactTable:
-    """Return the rows of several links as one table."""
-    return ArtifactTable(_LINK_HEADERS, [row for link in links for row in link.rows().rows])
-
-
-def _scaled(value: float | None, factor: float) -> float | None:
-    return None if value is None else factor * value
+    """Return a row for each number of a link that the log determines."""
+    rows = []
+    for link in links:
+        total = " + ".join(link.parts)
+        numbers = [
+            (f"{total}, mean", link.mean, 1e3, "ms"),
+            (f"{total}, 95 % of the messages", link.p95, 1e3, "ms"),
+            (f"{link.name}, deviation", link.deviation, 1e3, "ms"),
+            (f"{link.name}, lost", link.lost, 100.0, "%"),
+        ]
+        for label, r, factor, unit in numbers:
+            if r.value is not None:
+                ends = (None if end is None else factor * end for end in (r.low95, r.high95))
+                rows.append([label, factor * r.value, Interval(*ends), unit])
+    return ArtifactTable(("link", "estimate", "95 % interval", "unit"), rows)
 
 
 @dataclass(frozen=True, repr=False)
@@ -521,20 +432,18 @@ class Identification(Shown):
 
     Attributes:
         logs: The fitted recordings, then the recordings that are held out whole.
-        misfit: Root mean square of the residuals, in deviations of the measurement.
-        held_out: Errors of each position on held-out data, the largest first.
-        worst: The second in which the model explains a joint worst; None without samples, and in older files.
+        errors: Errors of each position on held-out data: on all of it, beside baselines, up to each of several
+            horizons, the worst joint first; then ahead and in a free run of each recording, beside the expected errors.
+        expected_error: The error to expect of each position on later data, ahead and in a free run; the joint with the
+            largest one beside its noise comes first.
+        worst: The second in which the model explains a joint worst; None without samples.
         aggregate: Quantities estimated from each recording alone; empty unless configured.
-        left_out: A fit for each held-out part; empty without folds.
-        expected_error: The error to expect of each position on later data, ahead and in a free run.
-        compared: Errors on held-out data, beside the errors that the held-out parts let expect.
         motion: Column -> lowest and highest position, and largest speed, in the fitted segments.
         tried: What optional terms gain on held-out parts; empty if none was tried.
         terms: Optional terms of the model in the fit; None if the model has no optional terms.
-        noise: Noise of the sensor; empty in older files.
-        widening: Factor on the posterior's deviations that covers errors of the model; None in older files.
+        noise: Noise of the sensor.
+        widening: Factor on the posterior's deviations that covers errors of the model; None without a posterior.
         settle_s: Length of the first part of a held-out segment, to which its initial state is fitted [s].
-        sigma: Field -> assumed deviation of a measurement.
         world: Name of the simulated world; None for the robot's own.
         posterior: Distribution from which training draws robots; None after an interrupted search.
         samples: Columns of the segments ``(N,)``: ``t``, ``into`` (since the segment's start) [s], ``segment``,
@@ -549,25 +458,17 @@ class Identification(Shown):
     verdict: Judgement
     parameters: tuple[Estimate, ...]
     search: Search = field(default_factory=Search)
-    misfit: float | None = None
-    check: Determined | None = None
-    prediction: tuple[Prediction, ...] = ()
-    held_out: tuple[ComparedError, ...] = ()
-    worst: WorstSecond | None = None
-    free_run: tuple[FreeRun, ...] = ()
-    aggregate: tuple[Quantity, ...] = ()
-    left_out: tuple[HeldOutPart, ...] = ()
+    errors: tuple[ComparedError, ...] = ()
     expected_error: tuple[ExpectedError, ...] = ()
-    compared: tuple[ComparedError, ...] = ()
+    worst: WorstSecond | None = None
+    aggregate: tuple[Quantity, ...] = ()
     motion: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     tried: tuple[TriedTerm, ...] = ()
     terms: tuple[str, ...] | None = None
     links: tuple[Link, ...] = ()
     noise: tuple[Noise, ...] = ()
     widening: float | None = None
-    segments: int | None = None
     settle_s: float = 0.0
-    sigma: Mapping[str, float] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
     world: str | None = None
     posterior: Posterior | None = None
@@ -603,24 +504,26 @@ class Identification(Shown):
         ]
         return ArtifactTable(("over recordings", "mean", "s.e.", "95 % of the next", "unit", "spread", "agree"), rows)
 
-    def held_out_table(self) -> ArtifactTable:
-        """Return the errors on held-out data: a row for each position, a column for each model."""
-        models = list(dict.fromkeys(model for row in self.held_out for model in row.rmse))
-        rows = [
-            [row.name, *(row.rmse.get(m) for m in models), row.unit, ", ".join(row.beaten_by) or "none"]
-            for row in self.held_out
-        ]
-        horizon = f"held-out RMSE, {self.held_out[0].seconds:g} s ahead" if self.held_out else ""
-        return ArtifactTable((horizon, *models, "unit", "no better than"), rows)
+    @property
+    def held_out(self) -> tuple[ComparedError, ...]:
+        """The errors on all held-out data up to the longest horizon, the worst joint first."""
+        rows = [e for e in self.errors if (e.source, e.kind) == (HELD_OUT, AHEAD)]
+        longest_s = max((e.seconds for e in rows), default=0.0)
+        return tuple(e for e in rows if e.seconds == longest_s)
+
+    @property
+    def judged(self) -> tuple[ComparedError, ...]:
+        """The errors beside an expected one, the largest ratio first; then those beside baselines alone."""
+        compared = sorted((e for e in self.errors if e.ratio is not None), key=lambda e: -(e.ratio or 0.0))
+        return (*compared, *(e for e in self.held_out if e.ratio is None))
 
     def expected_of(self, column: str, kind: ErrorKind) -> ExpectedError | None:
         """Return the expected error of a position; None if there is none."""
         return next((e for e in self.expected_error if (e.column, e.kind) == (column, kind)), None)
 
-    def compared_table(self) -> ArtifactTable:
-        """Return a row for each error on held-out data beside the expected one, the largest ratio first."""
-        known = [row for row in self.compared if row.ratio is not None]
-        return compared_table(sorted(known, key=lambda row: -(row.ratio or 0.0)), "held out")
+    def errors_table(self) -> ArtifactTable:
+        """Return a row for each error on held-out data that is judged."""
+        return compared_table(self.judged, "held out")
 
     @property
     def values(self) -> dict[str, float]:

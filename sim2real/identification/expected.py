@@ -14,13 +14,13 @@ import numpy as np
 from sim2real.artifacts.identification import (
     AHEAD,
     FREE_RUN,
+    HELD_OUT,
     ComparedError,
     ErrorKind,
     ExpectedError,
-    HeldOutPart,
     Identification,
 )
-from sim2real.identification.held_out import MOVES
+from sim2real.identification.held_out import MOVES, HeldOutPart
 from sim2real.identification.predictions import NOISE, Position
 from sim2real.identification.segments import Extent
 
@@ -75,32 +75,42 @@ def with_expected_errors(
     differ from its parts, in time and in temperature, so the error on it counts as a part in the expected error.
 
     Args:
-        document: With predictions and free runs.
+        document: With samples, free runs, and the errors on all held-out data.
         names: A name for each log; those that are held out whole come last.
         fitted: Number of fitted logs.
         wider: For each log the result of ``wider_for`` for its held-out data.
     """
-    compared, expected = list[ComparedError](), list[ExpectedError]()
+    compared, expected, judged = list[ComparedError](), list[ExpectedError](), dict[str, ComparedError]()
+    whole = {row.column: row for row in document.held_out}
     kinds: tuple[ErrorKind, ...] = (AHEAD, FREE_RUN)
     for p in positions:
         for kind in kinds:
             # A joint that rests in a part has no error there.
             those = [(part.ahead if kind == AHEAD else part.free).get(p.column) for part in parts]
             errors = [e if math.isfinite(e) else math.inf for e in those if e is not None]
-            limit, rows = _expected(errors, p), list[ComparedError]()
+            limit, rows, factor = _expected(errors, p), list[ComparedError](), 1.0
             for r, error, seconds in _on_held_out(document, p, kind, len(names)):
                 factor = wider[r].get(p.column, 1.0)
                 expects = None if limit is None or not math.isfinite(limit) else factor * limit
                 source, size = _source(names, r, fitted), error if math.isfinite(error) else None
                 rows.append(ComparedError(source, p.column, p.name, p.unit, kind, seconds, size, expects, factor))
-            compared += rows
+            if kind == AHEAD and len(rows) == 1 and p.column in whole:  # the data of one recording is all that there is
+                judged[p.column] = replace(whole[p.column], expected=rows[0].expected, wider=factor)
+            else:
+                compared += rows
             later = [math.inf if row.error is None else row.error / row.wider for row in rows]
             everything = _expected([*errors, *later], p) if len(errors) >= _LEAST_PARTS else None
             if everything is not None and math.isfinite(everything):
                 runs = [part.run_s for part in parts] if kind == FREE_RUN else []
                 seconds = max([*(row.seconds for row in rows), *runs], default=0.0)
                 expected.append(ExpectedError(p.column, p.name, p.unit, kind, seconds, everything))
-    return replace(document, expected_error=tuple(expected), compared=tuple(compared))
+    # The joint with the largest expected error beside its noise comes first.
+    sigma, sizes = {p.column: p.sigma for p in positions}, dict[str, float]()
+    for row in expected:
+        sizes[row.column] = max(sizes.get(row.column, 0.0), row.error / sigma[row.column])
+    expected.sort(key=lambda row: -sizes[row.column])
+    errors = [judged.get(row.column, row) if row in document.held_out else row for row in document.errors]
+    return replace(document, expected_error=tuple(expected), errors=(*errors, *compared))
 
 
 def expected_at(document: Identification, column: str, error_at_horizon: float) -> float:
@@ -143,7 +153,7 @@ def _on_held_out(
     if not columns:
         return
     counted = columns["held_out"].astype(bool) & (columns["into"] > document.settle_s)
-    horizons = {prediction.horizon_s for prediction in document.prediction}
+    horizons = {row.seconds for row in document.errors if row.source == HELD_OUT}
     for r in range(recordings):
         pick = counted & (columns["recording"] == r)
         measured = columns[f"{p.column}_measured"][pick]

@@ -107,7 +107,7 @@ class Fit:
     @property
     def record(self) -> Search:
         """How search and refinement went, for the artifact."""
-        return replace(self.search.record if self.search else Search(), engine=str(self.problem.engine))
+        return Search(self.search.evaluations if self.search else 0, engine=str(self.problem.engine))
 
     def uncertainty(self) -> Uncertainty:
         """Return how uncertain the estimate is."""

@@ -7,13 +7,12 @@ without a part follows by linear algebra; a short descent ends there.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from sim2real.artifacts.identification import HeldOutPart
 from sim2real.errors import UsageError
 from sim2real.identification.fit import Fit, bounded_step, refine, with_terms
 from sim2real.identification.parameters import ParameterTable
@@ -31,6 +30,28 @@ _ROUNDING_S = 1e-6
 _GAIN, _SLOPES = 1e-3, 1
 """Relative gain of the loss at which a descent without a part ends; the Jacobians of a round that it computes, as it
 begins with that of all parts."""
+
+
+@dataclass(frozen=True)
+class HeldOutPart:
+    """A fit without one part of the recordings, and its errors on that part.
+
+    Attributes:
+        terms: Optional terms of the model in this fit.
+        values: Parameter -> estimate of this fit.
+        share: Parameter -> share of the information in all recordings that the part holds.
+        ahead: Field -> root mean square error on the part up to the longest horizon; None without data.
+        free: Field -> root mean square error of a free run over the part; empty without a free run.
+        run_s: Length of the free run [s].
+    """
+
+    name: str
+    terms: tuple[str, ...]
+    values: Mapping[str, Any]
+    share: Mapping[str, float]
+    ahead: Mapping[str, float | None]
+    free: Mapping[str, float | None] = field(default_factory=dict)
+    run_s: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Predictions of a model, their errors over horizons and in free runs, and baselines without a model beside them."""
+"""Predictions of a model, their errors over horizons, and baselines without a model beside them."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sim2real.artifacts.identification import FreeRun, Prediction, WorstSecond, worst_window
+from sim2real.artifacts.identification import WorstSecond, worst_window
 from sim2real.graph.node import TICKS_PER_S
 from sim2real.identification.model import IdentifiableModel, position_of
 from sim2real.identification.problem import Problem
@@ -37,6 +37,15 @@ class Position:
     name: str
     unit: str
     sigma: float
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Errors of a model on held-out segments up to a horizon: field -> root mean square error; None without data."""
+
+    model: str
+    horizon_s: float
+    rmse: Mapping[str, float | None]
 
 
 def positions(model: IdentifiableModel, units: Mapping[str, str]) -> list[Position]:
@@ -123,7 +132,7 @@ def errors(
     settle_s: float,
     horizons: Sequence[float],
 ) -> list[Prediction]:
-    """Return each model's error over each horizon, on fitted and on held-out segments.
+    """Return each model's error over each horizon, on held-out segments.
 
     The baseline ``hold`` keeps the last measurement. If commands are positions, the second baseline is the goal itself.
 
@@ -138,46 +147,16 @@ def errors(
     for model in (*models, *_baselines(columns)):
         predicted = {n: p for n in names if (p := _predicted(columns, n, model, ahead)) is not None}
         for horizon_s in horizons:
-            for held_out in (False, True):
-                pick = (columns["held_out"] == held_out) & (ahead > 0) & (ahead <= horizon_s)
-                off = {n: (p - columns[f"{n}_measured"])[pick] for n, p in predicted.items()}
-                rmse = {n: float(np.sqrt(np.mean(o**2))) if o.size else None for n, o in off.items()}
-                rows.append(Prediction(model, horizon_s, held_out, rmse))
+            pick = columns["held_out"].astype(bool) & (ahead > 0) & (ahead <= horizon_s)
+            off = {n: (p - columns[f"{n}_measured"])[pick] for n, p in predicted.items()}
+            rmse = {n: float(np.sqrt(np.mean(o**2))) if o.size else None for n, o in off.items()}
+            rows.append(Prediction(model, horizon_s, rmse))
     return rows
 
 
 def _baselines(columns: Mapping[str, np.ndarray]) -> list[str]:
     """Return the names of the baselines: ``hold``, and that of the goal if commands are positions."""
     return ["hold", *([GOAL] if any(n.endswith(f"_{GOAL}") for n in columns) else [])]
-
-
-def free_runs(
-    columns: Mapping[str, np.ndarray], names: Sequence[str], models: Sequence[str], settle_s: float
-) -> list[FreeRun]:
-    """Return the errors of whole segments.
-
-    Args:
-        columns: Result of ``samples`` for long segments.
-        models: Names of the models; the baselines are added.
-        settle_s: First part of a segment, which does not count [s].
-    """
-    rows = []
-    ahead = columns["into"] - settle_s
-    for segment in np.unique(columns["segment"]):
-        pick = (columns["segment"] == segment) & (ahead > 0)
-        if not pick.any():
-            continue
-        t = columns["t"][pick]
-        recording, held_out = int(columns["recording"][pick][0]), bool(columns["held_out"][pick][0])
-        for model in (*models, *_baselines(columns)):
-            for name in names:
-                predicted = _predicted(columns, name, model, ahead)
-                if predicted is None:
-                    continue
-                off = (predicted - columns[f"{name}_measured"])[pick]
-                rmse = float(np.sqrt(np.mean(off**2)))
-                rows.append(FreeRun(model, recording, float(t[0]), float(t[-1] - t[0]), held_out, name, rmse))
-    return rows
 
 
 def _predicted(columns: Mapping[str, np.ndarray], field: str, model: str, ahead: np.ndarray) -> np.ndarray | None:
@@ -256,7 +235,7 @@ def worst_second(
             still = max(motion[recording], NOISE * p.sigma)
             score = (max(error - NOISE * p.sigma, 0.0) / still, error / p.sigma)
             if best is None or score > best[0]:
-                sizes = (error, error / p.sigma, error / still) if math.isfinite(error) else (None, None, None)
+                sizes = (error, error / still) if math.isfinite(error) else (None, None)
                 segment = int(samples["segment"][rows[0]])
                 best = score, WorstSecond(p.name, p.column, p.unit, recording, segment, begin_s, end_s, *sizes)
     return None if best is None else best[1]

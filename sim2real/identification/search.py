@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sim2real.artifacts.identification import Search
 from sim2real.artifacts.summary import ArtifactTable, Shown
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.identification.config import FitConfig
@@ -41,12 +40,14 @@ class SearchResult:
     Attributes:
         x: Shape ``(P,)``: the best candidate.
         loss: Its loss.
-        record: Strategy, evaluations, and the best loss up to each generation.
+        history: Shape ``(generations,)``: the best loss up to each generation.
+        evaluations: Number of simulated candidates.
     """
 
     x: np.ndarray
     loss: float
-    record: Search
+    history: np.ndarray
+    evaluations: int
 
 
 def strategies() -> list[str]:
@@ -122,8 +123,7 @@ def search(
             "no candidate could be simulated: every loss is infinite or no number",
             hint="check the bounds: they may admit only unstable models",
         )
-    record = Search(strategy=config.strategy, history=np.array(history), evaluations=config.population * len(history))
-    return SearchResult(best, loss, record)
+    return SearchResult(best, loss, np.array(history), config.population * len(history))
 
 
 def _strategy(config: FitConfig, size: int) -> tuple[PyTree, PyTree]:
@@ -256,8 +256,8 @@ def minimise(
         {n: np.asarray(v) for n, v in values.items()},
         result.loss if better else first,
         first,
-        result.record.history,
-        result.record.evaluations + 1,
+        result.history,
+        result.evaluations + 1,
     )
 
 

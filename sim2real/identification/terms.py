@@ -12,10 +12,10 @@ from itertools import combinations
 
 import numpy as np
 
-from sim2real.artifacts.identification import HeldOutPart, Outcome, TriedTerm
+from sim2real.artifacts.identification import Outcome, TriedTerm
 from sim2real.identification import held_out
 from sim2real.identification.fit import Fit, refine, with_terms
-from sim2real.identification.held_out import Fold, Statistics, on_held_out_parts, statistics
+from sim2real.identification.held_out import Fold, HeldOutPart, Statistics, on_held_out_parts, statistics
 from sim2real.identification.parameters import ParameterTable
 from sim2real.identification.predictions import labels
 from sim2real.identification.problem import MOST_OF_SETS, thinned

@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from sim2real.artifacts.identification import Determined, Noise, Quantity
+from sim2real.artifacts.identification import Noise, Quantity
 from sim2real.errors import UsageError
 from sim2real.identification.parameters import ParameterTable
 from sim2real.identification.problem import Problem, of_recordings
@@ -220,6 +220,21 @@ def _inflation(r: np.ndarray, compared: np.ndarray) -> float:
     return (1 + rho) / (1 - rho)
 
 
+@dataclass(frozen=True)
+class Determined:
+    """Which parameters the data determines.
+
+    Attributes:
+        undetermined: Groups of parameters; the data determines at most combinations of each group.
+        messages: The same in sentences.
+        standard_error_per_minute: Parameter -> expected standard error after one minute of such data.
+    """
+
+    undetermined: tuple[tuple[str, ...], ...]
+    messages: tuple[str, ...]
+    standard_error_per_minute: Mapping[str, float]
+
+
 def determined(problem: Problem, at: Linearised, without: Collection[str] = ()) -> Determined:
     """Return which parameters the data determines at a linearised point, with the noise of the channels alone.
 
@@ -318,8 +333,6 @@ def aggregate(estimates: np.ndarray, errors: np.ndarray, name: str = "", unit: s
     return Quantity(
         name,
         unit,
-        x,
-        np.asarray(errors, np.float64),
         mean,
         error,
         float(np.sqrt(between)),

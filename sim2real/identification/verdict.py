@@ -7,10 +7,10 @@ from typing import Literal
 
 import numpy as np
 
-from sim2real.artifacts.identification import AHEAD, ComparedError, Determined, Judgement, Prediction
+from sim2real.artifacts.identification import AHEAD, HELD_OUT, ComparedError, Judgement
 from sim2real.identification.parameters import Parameter, ParameterTable
-from sim2real.identification.predictions import NOISE, Position
-from sim2real.identification.uncertainty import ABSENT, BOUND, NOT_REACHED, OK, Uncertainty
+from sim2real.identification.predictions import NOISE, Position, Prediction
+from sim2real.identification.uncertainty import ABSENT, BOUND, NOT_REACHED, OK, Determined, Uncertainty
 
 Status = Literal["accepted", "record again", "change the model", "not finished"]
 ACCEPTED: Status = "accepted"
@@ -37,9 +37,9 @@ def scores(prediction: Sequence[Prediction], positions: Sequence[Position]) -> l
         prediction: Result of ``prediction.errors``.
     """
     columns = [p.column for p in positions]
-    held_out = [row for row in prediction if row.held_out and any(row.rmse.get(c) is not None for c in columns)]
-    horizon_s = max((row.horizon_s for row in held_out), default=None)
-    last = {row.model: row.rmse for row in held_out if row.horizon_s == horizon_s}
+    known = [row for row in prediction if any(row.rmse.get(c) is not None for c in columns)]
+    horizon_s = max((row.horizon_s for row in known), default=None)
+    last = {row.model: row.rmse for row in known if row.horizon_s == horizon_s}
     if horizon_s is None or "identified" not in last:
         return []
     rows = []
@@ -66,13 +66,14 @@ def _scored(p: Position, horizon_s: float, errors: Mapping[str, float | None]) -
     beaten_by = () if error <= noise else tuple(m for m, e in others.items() if error > _BETTER * e)
     size, *others_ = [e if math.isfinite(e) else None for e in (error, *finite.values())]
     baselines = dict(zip(finite, others_, strict=True))
-    place = ("held-out data", p.column, p.name, p.unit, AHEAD, horizon_s)
+    place = (HELD_OUT, p.column, p.name, p.unit, AHEAD, horizon_s)
     return excess, ComparedError(*place, size, beaten_by=beaten_by, baselines=baselines)
 
 
 def errors_of(row: ComparedError) -> dict[str, float]:
     """Return model -> root mean square error of a position; infinite where the model diverged."""
-    return {model: math.inf if error is None else error for model, error in row.rmse.items()}
+    errors = {"identified": row.error, **row.baselines}
+    return {model: math.inf if error is None else error for model, error in errors.items()}
 
 
 @dataclass(frozen=True)

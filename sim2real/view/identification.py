@@ -9,7 +9,6 @@ from matplotlib.lines import Line2D
 
 from sim2real.artifacts.files import number as as_number
 from sim2real.artifacts.identification import (
-    MAX_ERROR_RATIO,
     Estimate,
     Identification,
     Link,
@@ -69,10 +68,9 @@ def identify_section(artifact: StageFolder) -> PageSection:
         *_expected(result),
         *_parameters(result),
         *_recordings(result),
-        *_held_out_parts(result),
         *tried_blocks(result),
         *link_blocks(result.links),
-        *_predictions(result),
+        *([_prediction_figure(result)] if result.free or result.samples else []),
         *_correlation(result),
         *about(artifact),
     ]
@@ -106,8 +104,6 @@ def _tiles(result: Identification) -> Iterator[Tile]:
             error = "" if e.standard_error is None else f" ± {1e3 * e.standard_error:.1f}"
             truth = "" if e.truth is None else f"truth {1e3 * e.truth:.1f} ms"
             yield Tile(e.name.replace("_", " "), f"{1e3 * e.estimate:.1f}{error} ms", truth)
-    if result.misfit is not None:
-        yield Tile("residuals of the fit", f"{number(result.misfit, 2)} times", "the assumed noise of a measurement")
     seconds, evaluations = result.search.seconds, result.search.evaluations
     if seconds is not None:
         simulated = [f"{number(evaluations)} evaluations" if evaluations else "", result.search.engine]
@@ -147,8 +143,8 @@ def worst_figure(result: Identification, name: str) -> FigureBlock | None:
     difference = Line(*with_gaps(t_s, scale * rest, pieces), residual, "residual")
     svg = compared(lines, difference, label, (worst.begin_s, worst.end_s), name)
     size = ""
-    if worst.of_motion is not None and worst.times_noise is not None:
-        size = f", {worst.of_motion:.0%} of the joint's motion and {worst.times_noise:.0f} times the noise"
+    if worst.of_motion is not None:
+        size = f", {worst.of_motion:.0%} of the joint's motion"
     meaning = "Residual: measured \u2212 identified; the error is its root mean square in this second."
     return FigureBlock(svg, f"The worst second: {worst.text(result.logs)}{size}. {meaning}")
 
@@ -161,21 +157,10 @@ def _parameters(result: Identification) -> list[Block]:
     bounded = [e for e in result.parameters if e.verdict == "at a bound"]
     active = f"At a bound: {', '.join(_at_bound(e) for e in bounded)}." if bounded else "No estimate is at a bound."
     caption = f"Each estimate with its 95 % interval within the bounds of the search. {active}"
-    blocks: list[Block] = [
+    return [
         _parameter_table(result.parameters),
         FigureBlock(intervals_svg(result.parameters, "identify-intervals"), caption),
     ]
-    if result.check:
-        check = result.check
-        items = [sentence(m) for m in check.messages] or ["The data determines each parameter."]
-        blocks.append(ListBlock("Determined by the data", items))
-        errors = check.standard_error_per_minute
-        rows = [_minute(e, value) for e in result.parameters if (value := errors.get(e.name)) is not None]
-        if rows:
-            heads = ("parameter", "standard error", "unit", "share of the estimate")
-            caption = "Standard error from one minute of such data"
-            blocks.append(TableBlock(caption, heads, rows, (2,), folded=True))
-    return blocks
 
 
 def _parameter_table(estimates: Sequence[Estimate]) -> TableBlock:
@@ -206,12 +191,6 @@ def in_readable_unit(e: Estimate) -> Estimate:
         return e
     scaled = {n: getattr(e, n) for n in _NUMBERS}
     return replace(e, unit="ms", **{n: None if v is None else 1e3 * v for n, v in scaled.items()})
-
-
-def _minute(e: Estimate, error: float) -> list[str]:
-    scale, unit = (1e3, "ms") if e.unit == "s" else (1.0, pretty_unit(e.unit))
-    share = f"{100 * error / abs(e.estimate):.2g} %" if e.estimate else MISSING
-    return [e.name, number(scale * error, 2), unit, share]
 
 
 def _at_bound(e: Estimate) -> str:
@@ -299,12 +278,9 @@ def _recordings(result: Identification) -> list[Block]:
     """Return the estimates from each recording alone, and their spread."""
     if not result.aggregate:
         return []
-    count = len(result.aggregate[0].estimates)
-    names = _log_names(result)[:count]
-    logs = "".join(f" {i}: {log}." for i, log in enumerate(names)) if len(names) == count else ""
     loose = ", ".join(q.name for q in result.aggregate if not q.agree)
     agreement = f"differ in {loose} by more than the standard errors" if loose else "agree in all quantities"
-    caption = f"Estimates from each of {count} recordings alone, which {agreement}.{logs}"
+    caption = f"Means of the estimates from each recording alone, which {agreement}"
     return [TableBlock.of(caption, result.recordings_table())]
 
 
@@ -368,73 +344,13 @@ def _expected(result: Identification) -> list[Block]:
     items = [f"{e.name}, {e.how}: {number(e.error, 3)} {pretty_unit(e.unit)}".strip() for e in result.expected_error]
     lead = ListBlock("The errors to expect on later data, for motion like the fitted one", items)
     blocks: list[Block] = [lead] if items else []
-    table = TableBlock.of("Errors on held-out data beside the expected errors", result.compared_table())
-    ratios = [r.ratio or 0.0 for r in result.compared if r.ratio is not None]
-    tones: list[Tone] = ["bad" if r > MAX_ERROR_RATIO else "good" for r in sorted(ratios, reverse=True)]
+    table = TableBlock.of("Errors on held-out data beside the expected errors and baselines", result.errors_table())
+    judged = [row.exceeded or bool(row.beaten_by) for row in result.judged]
+    tones: list[Tone] = ["bad" if worse else "good" for worse in judged]
     first = replace(table, rows=table.rows[:_MOST_COMPARED], tones=tones[:_MOST_COMPARED])
     more = replace(table, rows=table.rows[_MOST_COMPARED:], tones=tones[_MOST_COMPARED:], folded=True)
-    more = replace(more, caption=f"Errors with smaller ratios ({len(more.rows)})")
+    more = replace(more, caption=f"Smaller errors ({len(more.rows)})")
     return [*blocks, *(block for block in (first, more) if block.rows)]
-
-
-def _held_out_parts(result: Identification) -> list[Block]:
-    """Return the errors on held-out parts of the recordings, with their mean and the largest."""
-    rows = result.left_out
-    if not rows:
-        return []
-    # Make a column for each field, ahead and in a free run.
-    kinds = [(kind, column) for kind in ("ahead", "free") for column in getattr(rows[0], kind)]
-    units = {column: unit_of(column, result.units) for _, column in kinds}
-    heads = [f"{column} {'ahead' if kind == 'ahead' else 'in a free run'} [{units[column]}]" for kind, column in kinds]
-    errors = np.array([[getattr(r, kind).get(column, np.nan) for kind, column in kinds] for r in rows], np.float64)
-    with_terms = bool(result.terms) or any(r.terms for r in rows)
-    # Add the mean and the largest error of each column; a part in which a joint rests has no error.
-    finite = [column[np.isfinite(column)] for column in errors.T]
-    summed = [
-        (name, [reduce(column) if column.size else np.nan for column in finite], "")
-        for name, reduce in (("mean", np.mean), ("worst", np.max))
-    ]
-    parts = [(r.name, e, ", ".join(r.terms) or "none") for r, e in zip(rows, errors, strict=True)]
-    table = [
-        [name, *([terms] if with_terms else []), *(number(float(e), 3) for e in values)]
-        for name, values, terms in [*parts, *summed]
-    ]
-    columns = ["held-out part", *(["terms"] if with_terms else []), *heads]
-    caption = "Root mean square errors on each held-out part, of a fit without it"
-    return [TableBlock(caption, columns, table, text_columns=(0, 1) if with_terms else (0,), folded=True)]
-
-
-def _predictions(result: Identification) -> list[Block]:
-    """Return the measurements beside the model's predictions, and the tables of errors."""
-    blocks: list[Block] = []
-    if result.free or result.samples:
-        blocks.append(_prediction_figure(result))
-    if len(result.held_out) > 1:
-        caption = f"Held-out RMSE of every position after {result.held_out[0].seconds:g} s, the largest first"
-        blocks.append(replace(TableBlock.of(caption, result.held_out_table()), folded=True))
-    if result.prediction:
-        fields = list(dict.fromkeys(f for row in result.prediction for f in row.rmse))
-        heads = [f"RMSE of {with_unit(f, result.units)}" for f in fields]
-        rows = [
-            [r.model, number(r.horizon_s, 3), "held out" if r.held_out else "fitted"]
-            + [number(r.rmse.get(f)) for f in fields]
-            for r in result.prediction
-        ]
-        heads = ("model", "horizon [s]", "data", *heads)
-        blocks.append(TableBlock("Errors over the horizon", heads, rows, (2,), folded=True))
-    if result.free_run:
-        several = len(result.recordings) > 1
-        rows = [
-            [
-                *(r.model, *([_title(result, r.recording)] if several else []), r.field, number(r.seconds, 3)),
-                *(number(r.rmse), unit_of(r.field, result.units) or MISSING),
-            ]
-            for r in result.free_run
-        ]
-        heads = ("model", *(["recording"] if several else []), "field", "length [s]", "RMSE", "unit")
-        text = (1, 2, 5) if several else (1, 4)
-        blocks.append(TableBlock("Free runs", heads, rows, text, folded=True))
-    return blocks
 
 
 def _prediction_figure(result: Identification) -> FigureBlock:

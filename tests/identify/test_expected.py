@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from sim2real.artifacts.identification import AHEAD, FREE_RUN, HeldOutPart, Identification, Judgement, Prediction
+from sim2real.artifacts.identification import AHEAD, FREE_RUN, Identification, Judgement
 from sim2real.identification.expected import wider_for, with_expected_errors
+from sim2real.identification.held_out import HeldOutPart
 from sim2real.identification.verdict import Position
 
 JOINT = Position("position[0]", "pan", "rad", 0.001)
@@ -25,15 +26,7 @@ def samples(error, measured=None):
 
 def judged(parts, error=0.01, wider=1.0, measured=None):
     rows = samples(error, measured)
-    document = Identification(
-        "robot",
-        (),
-        Judgement("", ()),
-        (),
-        samples=rows,
-        free=rows,
-        prediction=(Prediction("identified", 2.0, True, {}),),
-    )
+    document = Identification("robot", (), Judgement("", ()), (), samples=rows, free=rows)
     return with_expected_errors(document, [JOINT], parts, ["log"], 1, [{JOINT.column: wider}])
 
 
@@ -41,7 +34,7 @@ def test_it_is_the_worst_part_and_a_quarter():
     found = judged([part("a", 0.01, 0.02), part("b", 0.03, 0.04), part("c", None, None)])
     assert found.expected_of(JOINT.column, AHEAD).error == pytest.approx(1.25 * 0.03)
     assert found.expected_of(JOINT.column, FREE_RUN).error == pytest.approx(1.25 * 0.04)
-    ahead = found.compared[0]
+    ahead = found.errors[0]
     assert (ahead.expected, ahead.ratio) == (pytest.approx(1.25 * 0.03), pytest.approx(0.01 / (1.25 * 0.03)))
     assert not ahead.exceeded
 
@@ -50,14 +43,14 @@ def test_of_many_parts_one_that_stands_out_does_not_decide():
     errors = [*np.linspace(0.01, 0.02, 15), 0.05]
     found = judged([part(str(i), e, e) for i, e in enumerate(errors)])
     assert found.expected_of(JOINT.column, AHEAD).error == pytest.approx(1.25 * np.quantile([*errors, 0.01], 0.9))
-    assert found.compared[0].expected < 1.25 * 0.03
+    assert found.errors[0].expected < 1.25 * 0.03
     diverged = judged([part(str(i), e, np.inf if i == 3 else e) for i, e in enumerate(errors)])
     assert diverged.expected_of(JOINT.column, FREE_RUN) is None
 
 
 def test_an_error_on_held_out_data_is_compared_and_expected_from_then_on():
     found = judged([part("a", 0.01, 0.01), part("b", 0.02, 0.01)], error=0.08, wider=2.0)
-    ahead = found.compared[0]
+    ahead = found.errors[0]
     assert (ahead.expected, ahead.wider) == (pytest.approx(2.0 * 1.25 * 0.02), 2.0)
     assert ahead.ratio == pytest.approx(1.6)
     assert ahead.exceeded
@@ -68,12 +61,12 @@ def test_an_error_on_held_out_data_is_compared_and_expected_from_then_on():
 def test_too_few_parts_or_one_that_diverged_let_expect_nothing(parts):
     found = judged(parts)
     assert found.expected_error == ()
-    assert [row.expected for row in found.compared] == [None, None]
+    assert [row.expected for row in found.errors] == [None, None]
 
 
 def test_it_is_not_below_the_noise_and_a_joint_at_rest_is_not_compared():
     found = judged([part("a", 1e-5, 1e-5), part("b", 1e-5, 1e-5)], error=0.0, measured=NO_MOTION)
-    assert found.compared == ()
+    assert found.errors == ()
     assert found.expected_of(JOINT.column, AHEAD).error == pytest.approx(2.0 * JOINT.sigma)
 
 

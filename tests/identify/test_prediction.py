@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sim2real.identification.model import Channel
-from sim2real.identification.predictions import errors, free_runs, labels, ringing
+from sim2real.identification.predictions import errors, labels, ringing
 
 SETTLE_S = 0.2
 
@@ -43,11 +43,9 @@ def test_columns_are_named_by_field_and_index(problem):
 
 
 def test_errors_count_from_the_end_of_settling_to_the_horizon(problem, columns):
-    rows = {(r.model, r.horizon_s, r.held_out): r
-            for r in errors(problem, columns, ["model"], SETTLE_S, [0.2001, 0.5001])}  # fmt: skip
-    assert len(rows) == 2 * 2 * 2
-    assert rows["model", 0.2001, False].rmse["th"] == pytest.approx(0.5)
-    short, long = rows["model", 0.2001, True], rows["model", 0.5001, True]
+    rows = {(r.model, r.horizon_s): r for r in errors(problem, columns, ["model"], SETTLE_S, [0.2001, 0.5001])}
+    assert len(rows) == 2 * 2
+    short, long = rows["model", 0.2001], rows["model", 0.5001]
     assert short.rmse["th"] == pytest.approx(1.0)  # 0.3 and 0.4 s: off by 1
     assert long.rmse["th"] == pytest.approx(np.sqrt((1 + 1 + 4 + 4 + 4) / 5))  # and 0.5, 0.6 and 0.7 s: off by 2
     assert long.rmse["thdot"] == pytest.approx(2 * long.rmse["th"])
@@ -55,41 +53,22 @@ def test_errors_count_from_the_end_of_settling_to_the_horizon(problem, columns):
 
 
 def test_holding_still_says_what_was_measured_last(problem, columns):
-    rows = {(r.model, r.held_out): r for r in errors(problem, columns, ["model"], SETTLE_S, [0.2001])}
-    assert rows["hold", False].rmse["th"] == 0.0
+    rows = {r.model: r for r in errors(problem, columns, ["model"], SETTLE_S, [0.2001])}
     # The last measurement before the horizon is the one at 0.2 s, 2: then 3 and 4 come.
-    assert rows["hold", True].rmse["th"] == pytest.approx(np.sqrt((1 + 4) / 2))
+    assert rows["hold"].rmse["th"] == pytest.approx(np.sqrt((1 + 4) / 2))
 
 
 def test_no_samples_no_number(problem, columns):
     fitted = {n: c[~columns["held_out"]] for n, c in columns.items()}
-    rows = [r for r in errors(problem, fitted, ["model"], SETTLE_S, [0.3]) if r.held_out]
+    rows = errors(problem, fitted, ["model"], SETTLE_S, [0.3])
     assert {(r.rmse["th"], r.rmse["q[2]"]) for r in rows} == {(None, None)}
 
 
 def test_told_is_where_a_joint_was_told_to_be(problem, columns):
     columns = {**columns, "q[2]_told": columns["q[2]_measured"] + np.where(columns["into"] > 0.45, 0.3, 0.1)}
-    rows = {(r.model, r.horizon_s): r for r in errors(problem, columns, ["model"], SETTLE_S, [0.2001, 0.5001])
-            if r.held_out}  # fmt: skip
+    rows = {(r.model, r.horizon_s): r for r in errors(problem, columns, ["model"], SETTLE_S, [0.2001, 0.5001])}
     assert rows["told", 0.2001].rmse["q[2]"] == pytest.approx(0.1)
     assert set(rows["told", 0.2001].rmse) == {"q[2]"}
-    free = [r for r in free_runs(columns, ["th", "q[2]"], ["model"], SETTLE_S) if r.model == "told"]
-    assert {r.field for r in free} == {"q[2]"}
-
-
-def test_free_runs_are_whole_segments(columns):
-    rows = free_runs(columns, ["th", "thdot"], ["model"], SETTLE_S)
-    assert len(rows) == 2 * 2 * 2
-    row = next(r for r in rows if r.held_out and r.field == "thdot" and r.model == "model")
-    assert (row.recording, row.begin_s, row.seconds) == (5, pytest.approx(20.3), pytest.approx(0.4))
-    assert row.rmse == pytest.approx(2 * np.sqrt((1 + 1 + 4 + 4 + 4) / 5))
-    hold = next(r for r in rows if r.held_out and r.field == "th" and r.model == "hold")
-    assert hold.rmse == pytest.approx(np.sqrt(np.mean(np.arange(1, 6) ** 2)))
-
-
-def test_a_segment_that_ends_while_settling_is_left_out(columns):
-    short = {n: c[(columns["segment"] == 1) | (columns["into"] < SETTLE_S)] for n, c in columns.items()}
-    assert {r.recording for r in free_runs(short, ["th"], ["model"], SETTLE_S)} == {5}
 
 
 @pytest.mark.parametrize(("resonance_hz", "found"), [(15.0, True), (8.0, True), (None, False)])

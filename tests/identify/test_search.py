@@ -29,10 +29,10 @@ def test_a_bowls_bottom_is_found_and_reported():
     found = search(losses, *BOX, CONFIG, on_generation=lambda best, z: told.append(best))
     np.testing.assert_allclose(found.x, BOTTOM, atol=0.02)
     assert found.loss == pytest.approx(float(bowl(found.x[None])[0]))
-    assert len(found.record.history) < 300  # it ends once it is stuck
-    assert np.all(np.diff(found.record.history) <= 0)
-    assert found.record.evaluations == 16 * len(found.record.history)
-    assert told == found.record.history.tolist()
+    assert len(found.history) < 300  # it ends once it is stuck
+    assert np.all(np.diff(found.history) <= 0)
+    assert found.evaluations == 16 * len(found.history)
+    assert told == found.history.tolist()
     assert all(np.array_equal(middle, middles[0]) for middle in middles[:10])
     assert not np.array_equal(middles[10], middles[0])
 
@@ -41,7 +41,7 @@ def test_one_seed_one_result():
     config = replace(CONFIG, strategy="SNES", population=8, generations=3)
     first, again, other = (search(bowl, *BOX, replace(config, seed=s)) for s in (5, 5, 6))
     np.testing.assert_array_equal(first.x, again.x)
-    np.testing.assert_array_equal(first.record.history, again.record.history)
+    np.testing.assert_array_equal(first.history, again.history)
     assert not np.array_equal(first.x, other.x)
 
 
@@ -67,7 +67,7 @@ def test_every_strategy_runs_or_says_why_not(strategy):
             search(bowl, *BOX, config)
     else:
         found = search(bowl, *BOX, config)
-        assert found.record.evaluations == 80
+        assert found.evaluations == 80
         assert found.loss <= float(bowl(np.zeros((1, 2)))[0]) + 1e-3
         assert found.loss == pytest.approx(float(bowl(found.x[None])[0]))
 

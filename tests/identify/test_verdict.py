@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sim2real.artifacts.identification import Determined, Prediction
 from sim2real.identification import verdict
 from sim2real.identification.parameters import Parameter, ParameterTable
-from sim2real.identification.predictions import Position
+from sim2real.identification.predictions import Position, Prediction
+from sim2real.identification.uncertainty import Determined
 from sim2real.identification.verdict import scores
 
 DELAYS = ("sensor_delay", "actuator_delay")
@@ -26,14 +26,14 @@ ONE = (Position("th", "th", "rad", 1e-6),)
 TWO = (Position("position[0]", "pan", "rad", 0.002), Position("position[1]", "tilt", "rad", 0.002))
 
 
-def rows(identified, nominal, horizon_s=1.0, held_out=True, column="th", **others):
+def rows(identified, nominal, horizon_s=1.0, column="th", **others):
     errors = {"identified": identified, "nominal": nominal, **others}
-    return [Prediction(m, horizon_s, held_out, {column: e}) for m, e in errors.items()]
+    return [Prediction(m, horizon_s, {column: e}) for m, e in errors.items()]
 
 
 def both(first, second):
     """Return rows of two positions; model -> error of each."""
-    return [Prediction(m, 1.0, True, {"position[0]": first[m], "position[1]": e}) for m, e in second.items()]
+    return [Prediction(m, 1.0, {"position[0]": first[m], "position[1]": e}) for m, e in second.items()]
 
 
 def spread(misfit=1.0, **verdicts):
@@ -70,9 +70,9 @@ def test_a_baseline_that_diverges_is_no_better(diverged):
 
 
 def test_the_longest_horizon_on_held_out_data_decides():
-    prediction = rows(2.0, 1.0, horizon_s=0.1) + rows(0.5, 1.0, horizon_s=1.0) + rows(9.0, 1.0, 2.0, held_out=False)
+    prediction = rows(2.0, 1.0, horizon_s=0.1) + rows(0.5, 1.0, horizon_s=1.0)
     assert judge(prediction).status == "accepted"
-    nothing = [Prediction("identified", 3.0, True, {"th": None})]
+    nothing = [Prediction("identified", 3.0, {"th": None})]
     assert judge(prediction + nothing).status == "accepted"
 
 
@@ -97,7 +97,7 @@ def test_the_worst_position_comes_first_and_all_are_told():
 
 
 def test_where_commands_are_no_positions_nothing_was_told():
-    prediction = [*rows(0.1, 1.0), Prediction("told", 1.0, True, {"other": 0.01})]
+    prediction = [*rows(0.1, 1.0), Prediction("told", 1.0, {"other": 0.01})]
     assert judge(prediction).status == "accepted"
 
 
@@ -192,7 +192,7 @@ def test_the_first_that_applies_is_the_status_and_all_are_reasons():
 
 
 def test_nothing_held_out_is_told():
-    found = judge(rows(0.1, 1.0, held_out=False))
+    found = judge([])
     assert found.reasons == ("no data was held out: the error of its predictions is unknown",)
 
 

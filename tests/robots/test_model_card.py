@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sim2real import cli, errors
-from sim2real.artifacts.identification import Estimate, Identification, Judgement
+from sim2real.artifacts.identification import AHEAD, HELD_OUT, ComparedError, Estimate, Identification, Judgement
 from sim2real.artifacts.posterior import Posterior
 from sim2real.graph.episode import Episode, Steps
 from sim2real.identification import predictions as prediction
@@ -68,8 +68,7 @@ def known(robot, episode, values, begins_s):
         samples=columns,
         free=free,
         settle_s=SETTLE_S,
-        prediction=tuple(prediction.errors(problem, columns, ["identified"], SETTLE_S, [0.1, 1.0])),
-        free_run=tuple(prediction.free_runs(free, prediction.labels(long), ["identified"], SETTLE_S)),
+        errors=tuple(ComparedError(HELD_OUT, "th", "th", "", AHEAD, s, 0.0) for s in (0.1, 1.0)),
         replays=replays(problem, values, SETTLE_S, "ahead") | replays(long, values, SETTLE_S, "free"),
         units=robot.units,
     )

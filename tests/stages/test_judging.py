@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sim2real.artifacts.deployment import Advice, Changed, Deployment, Drift, Gap, Replay, Scores
-from sim2real.artifacts.identification import Noise, Prediction
+from sim2real.artifacts.identification import Noise
 from sim2real.artifacts.recording import Recording
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode, Steps
@@ -200,9 +200,8 @@ def test_the_verdict_is_in_the_artifact(tmp_path):
 def test_a_prediction_that_diverges_is_infinitely_wrong(monkeypatch, errors, limit):
     left = iter(errors)
     monkeypatch.setattr(replay.prediction, "samples", lambda *_: {})
-    monkeypatch.setattr(
-        replay.prediction, "errors", lambda *_: [Prediction("identified", 1.0, True, {"th": next(left)})]
-    )
+    row = lambda *_: [replay.prediction.Prediction("identified", 1.0, {"th": next(left)})]  # noqa: E731
+    monkeypatch.setattr(replay.prediction, "errors", row)
     problem = SimpleNamespace(ts=np.zeros((1, 3)), segments=1, readings={"th": np.zeros((1, 3))})
     problem.with_readings = lambda readings: problem
     noise = (Noise("th", "rad", 0.01, 0.0, 0.0),)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sim2real.artifacts.identification import HeldOutPart
 from sim2real.errors import UsageError
+from sim2real.identification.held_out import HeldOutPart
 from sim2real.identification.parameters import Parameter, ParameterTable
 from sim2real.identification.predictions import Position
 from sim2real.identification.residuals import Linearised

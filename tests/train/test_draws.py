@@ -74,9 +74,8 @@ def test_what_the_model_leaves_unexplained_widens_the_draws(found, options, rand
 
 
 def test_what_differs_between_recordings_widens_them_too(found):
-    two = np.ones(2)
     both = tuple(
-        Quantity(n, "1", two, two, mean, 0.0, between, 0.0, 1.0, False)
+        Quantity(n, "1", mean, 0.0, between, 0.0, 1.0, False)
         for n, mean, between in (("gain", 20.0, 0.4), ("actuator_delay", 0.045, 0.002))
     )
     draws = drawn(replace(found, aggregate=both), misfit=False)

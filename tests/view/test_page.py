@@ -92,7 +92,7 @@ def test_the_numbers_are_there(page):
 
 
 def test_an_unexplained_second_makes_an_accepted_identification_doubtful():
-    worst = WorstSecond("elbow", "q", "rad", 0, 3, 5.1, 6.1, 0.8, 400.0, 0.49)
+    worst = WorstSecond("elbow", "q", "rad", 0, 3, 5.1, 6.1, 0.8, 0.49)
     found = Identification("robot", (), Judgement("accepted", ()), (), worst=worst)
     banners = [identify_banner(replace(found, worst=replace(worst, of_motion=share))) for share in (0.49, 0.5, None)]
     assert [banner.tone for banner in banners] == ["good", "doubt", "doubt"]
@@ -197,7 +197,7 @@ def test_one_seed_and_missing_numbers_are_shown(only):
     run = only("identify", "train")
     (run / "train" / "history.json").write_text(json.dumps({**synthetic_run.history(1), "best_seed": 0}))
     data = synthetic_run.parameters(truth=False)
-    for name in ("posterior", "search", "check", "misfit", "aggregate", "free_run"):
+    for name in ("posterior", "search", "aggregate"):
         del data[name]
     data |= {"verdict": {"status": "", "reasons": []}, "logs": []}
     (run / "identify" / "parameters.json").write_text(json.dumps(data))

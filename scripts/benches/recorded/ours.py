@@ -123,7 +123,7 @@ def _fit_pipeline(name: str, fold: Fold, seed: int) -> Fit:
         columns = predict_whole(case, {"identified": identified.values}, test)
         return [_at(case, columns, r, one) for r, one in enumerate(test_recordings)]
 
-    tried = identified.search.record.evaluations if identified.search else 0
+    tried = identified.search.evaluations if identified.search else 0
     return predict, f"{tried} candidates, then refined"
 
 

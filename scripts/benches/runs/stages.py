@@ -72,7 +72,7 @@ def nominal_run(pipeline: str, seed: int, runs: Path, run_dir: Path) -> Path:
 
 def estimates(identify: StageFolder) -> dict[str, Any]:
     """Return the errors of the dynamics and of the round trip with a true value, and on held-out data."""
-    compared = [row for row in Identification.load(identify.folder).compared if row.ratio is not None]
+    compared = [row for row in Identification.load(identify.folder).judged if row.ratio is not None]
     document = json.loads(identify.output("parameters").read_text())
     by_name = {p["name"]: p for p in document["parameters"]}
     trip = by_name["round_trip_delay"]

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sim2real.artifacts.files import make_folder, write_arrays, write_json
+from sim2real.artifacts.identification import HELD_OUT
 from sim2real.identification.export.plain import PlainSimulation
 from sim2real.identification.export.reproduce import Card
 from sim2real.identification.model import IdentifiableModel
@@ -158,30 +159,39 @@ def _held_out(identification: Identification, plain: PlainSimulation) -> dict[st
 def _figures(identification: Identification, signals: Mapping[str, np.ndarray]) -> Iterator[dict[str, Json]]:
     """Yield errors on held-out data, up to each horizon and in free runs, then recorded times and ranges of motion."""
     units = identification.units
-    runs: list[tuple[str, Mapping[str, float | None], dict[str, Json]]] = [
-        (f"up to {r.horizon_s:g} s ahead", r.rmse, {"run": "ahead", "horizon_s": r.horizon_s})
-        for r in identification.prediction
-        if r.model == "identified" and r.held_out
-    ]
-    runs += [
-        (
-            f"in a free run of {r.seconds:.3g} s of log {r.recording}",
-            {r.field: r.rmse},
-            {"run": "free", "horizon_s": r.seconds + 1.0, "recording": r.recording},
-        )
-        for r in identification.free_run
-        if r.model == "identified"
-    ]
-    for how, errors, where in runs:
-        for field, value in errors.items():
-            if value is not None and f"{where['run']}/into" in signals:
-                yield _figure(f"{field}, RMSE {how}", value, _unit(units, field), {"field": field, **where})
+    for how, samples, pick, where in _runs(identification):
+        for field in identification.fields:
+            off = (samples[f"{field}_identified"] - samples[f"{field}_measured"])[pick]
+            if off.size and np.isfinite(off).all() and f"{where['run']}/into" in signals:
+                error = float(np.sqrt(np.mean(off**2)))
+                yield _figure(f"{field}, RMSE {how}", error, _unit(units, field), {"field": field, **where})
     for name, values in signals.items():
         kind, _, owner = name.partition("/")
         finite = values[np.isfinite(values)]
         title, unit = (owner.replace("/", " of ", 1), "s") if kind == "times" else (owner, _unit(units, owner))
         for label, q in _QUANTILES.get(kind, ()) if finite.size else ():
             yield _figure(f"{title}, {label}", float(np.quantile(finite, q)), unit, {"signal": name, "q": q})
+
+
+def _runs(
+    identification: Identification,
+) -> Iterator[tuple[str, Mapping[str, np.ndarray], np.ndarray, dict[str, Json]]]:
+    """Yield each kind of prediction of held-out data: how, its columns, the rows that count, and its recipe."""
+    for run, samples in zip(RUNS, (identification.samples, identification.free), strict=True):
+        if not samples:
+            continue
+        ahead = samples["into"] - identification.settle_s
+        counts = samples["held_out"].astype(bool) & (ahead > 0.0)
+        if run == "ahead":
+            for horizon_s in sorted({row.seconds for row in identification.errors if row.source == HELD_OUT}):
+                how, where = f"up to {horizon_s:g} s ahead", {"run": run, "horizon_s": horizon_s}
+                yield how, samples, counts & (ahead <= horizon_s), where
+            continue
+        for recording in np.unique(samples["recording"][counts]).tolist():
+            pick = counts & (samples["recording"] == recording)
+            seconds = float(np.ptp(samples["t"][pick]))
+            where = {"run": run, "horizon_s": seconds + 1.0, "recording": recording}
+            yield f"in a free run of {seconds:.3g} s of log {recording}", samples, pick, where
 
 
 def _figure(name: str, value: float, unit: str, recipe: Mapping[str, Json]) -> dict[str, Json]:
@@ -197,7 +207,6 @@ def _unknown(identification: Identification) -> list[str]:
             sentences.append(f"{p.name} was not identified: it has its nominal value, {value}")
         elif p.verdict != "ok" and p.kind != "derived":
             sentences.append(f"{p.name} is {p.verdict}")
-    sentences += identification.check.messages if identification.check else ()
     return [*sentences, "outside of the motion, the speeds and the temperature of the log, the model extrapolates"]
 
 

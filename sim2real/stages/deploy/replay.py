@@ -6,7 +6,7 @@ from collections.abc import Container, Mapping, Sequence
 import numpy as np
 
 from sim2real.artifacts.deployment import AS_HERE, Drift, Replay
-from sim2real.artifacts.identification import UNFINISHED, Identification, Noise
+from sim2real.artifacts.identification import HELD_OUT, UNFINISHED, Identification, Noise
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode
 from sim2real.identification import drift as drift_test
@@ -69,7 +69,7 @@ def tested(
     held_out, held = (_held_out(identification, model, ahead_s) for model in ("identified", "hold"))
     rows = []
     for position in positions(problem.model, robot.units):
-        rmse = {e.model: e.rmse.get(position.column) for e in errors if e.held_out}
+        rmse = {e.model: e.rmse.get(position.column) for e in errors}
         rmse = {m: e if e is not None and math.isfinite(e) else None for m, e in rmse.items()}
         expected, moved, now = held_out.get(position.column), held.get(position.column), rmse.get("hold")
         if expected is not None:  # a model's error grows with the motion
@@ -78,8 +78,7 @@ def tested(
             expected = math.hypot(expected, alike.get(position.column, 0.0))
             # A model that diverges on its own motion bounds nothing.
             expected = expected if math.isfinite(expected) else None
-        free = _free_run(identification, position.column)
-        rows.append(Replay(position.name, position.unit, ahead_s, rmse, expected, position.column, free))
+        rows.append(Replay(position.name, position.unit, ahead_s, rmse, expected, position.column))
     return rows, drifted
 
 
@@ -96,7 +95,7 @@ def _problem(
         for episode in episodes:
             model.check(episode)
     # Choose the length of segments and the horizon.
-    horizons = sorted({p.horizon_s for p in identification.prediction})
+    horizons = sorted({row.seconds for row in identification.errors if row.source == HELD_OUT})
     length_s = max(_SEGMENT_S, config.settle_s + (horizons[0] if horizons else 0.0))
     ahead_s = max([h for h in horizons if config.settle_s + h <= length_s + 1e-9], default=length_s - config.settle_s)
 
@@ -183,7 +182,7 @@ def _of_noise(
         noisy = problem.with_readings(measured)
         predicted = prediction.samples(noisy, {"identified": values}, settle_s, every)
         errors = prediction.errors(noisy, predicted, ["identified"], settle_s, [ahead_s])
-        rmse = next(e.rmse for e in errors if e.held_out and e.model == "identified")
+        rmse = next(e.rmse for e in errors if e.model == "identified")
         for column in fields:
             error = rmse.get(column)
             rows[column].append(error if error is not None and math.isfinite(error) else math.inf)
@@ -192,12 +191,6 @@ def _of_noise(
 
 def _held_out(identification: Identification, model: str, ahead_s: float) -> Mapping[str, float]:
     """Return the error of a model on the identification's held-out data: field -> error."""
-    rows = [p for p in identification.prediction if p.model == model and p.held_out and p.horizon_s == ahead_s]
-    return {n: e for row in rows for n, e in row.rmse.items() if e is not None}
-
-
-def _free_run(identification: Identification, column: str) -> float | None:
-    """Return the mean error of the identified model in free runs on held-out data; None if it is unknown."""
-    rows = [r.rmse for r in identification.free_run if r.model == "identified" and r.held_out and r.field == column]
-    errors = [e for e in rows if e is not None]
-    return float(np.mean(errors)) if errors and len(errors) == len(rows) else None
+    rows = [row for row in identification.errors if (row.source, row.seconds) == (HELD_OUT, ahead_s)]
+    errors = {row.column: row.error if model == "identified" else row.baselines.get(model) for row in rows}
+    return {column: error for column, error in errors.items() if error is not None}

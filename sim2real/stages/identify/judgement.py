@@ -11,13 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from sim2real.artifacts.files import number
 from sim2real.artifacts.identification import (
+    FREE_RUN,
     ROUND_TRIP,
-    Determined,
     Estimate,
-    FreeRun,
-    HeldOutPart,
     Identification,
     Judgement,
     Noise,
@@ -31,6 +28,7 @@ from sim2real.identification import verdict
 from sim2real.identification.delays import links
 from sim2real.identification.expected import wider_for, with_expected_errors
 from sim2real.identification.fit import Fit, as_numbers, refine, refit
+from sim2real.identification.held_out import HeldOutPart
 from sim2real.identification.predictions import Position, positions, replays, ringing, worst_second
 from sim2real.identification.problem import Problem, few_of
 from sim2real.identification.residuals import Linearised
@@ -39,6 +37,7 @@ from sim2real.identification.terms import MENDS
 from sim2real.identification.uncertainty import (
     ABSENT,
     NOT_REACHED,
+    Determined,
     Uncertainty,
     compare_recordings,
     from_linearised,
@@ -118,14 +117,12 @@ def judge(fits: Fits, started_s: float) -> Identification:
         several = config.each and inputs.fitted > 1
         aggregate = patiently(lambda: compare_recordings(fit.problem, findings.at)) if several else ()
         links_ = patiently(lambda: links(fit.problem, fit.x)) if config.links else ()
-        document = replace(
-            document, left_out=parts, terms=fits.terms, tried=fits.tried, links=links_, aggregate=aggregate
-        )
+        document = replace(document, terms=fits.terms, tried=fits.tried, links=links_, aggregate=aggregate)
+        document = _compared(document, inputs, fit, parts)
         bar.set_description_str("identify: what the model lacks")
         lacks = patiently(lambda: lack(document, fits))
     if inputs.standing is not None:
         document = with_load(document, inputs.robot, inputs.standing, truth)
-    document = _compared(document, inputs, fit, parts)
     names = [n for n in inputs.undetermined if n not in document.values]
     # The robot's own bounds may be widened once.
     usual = defaults_of(inputs.loaded).identify.bounds
@@ -183,24 +180,13 @@ def _estimates(
         truth: Known parameters of the embedded robot.
         seconds: Duration of the search [s].
     """
-    fit, spread, check = findings.fit, findings.spread, findings.check
+    fit = findings.fit
     search = replace(fit.record, seconds=seconds)
+    rows = tuple(_rows(findings, truth))
+    document = Identification(pipeline, (), Judgement("", ()), rows, search)
     if not fit.converged:  # away from a minimum no interval means anything
-        rows = tuple(_without_interval(row) for row in _rows(findings, truth))
-        return Identification(
-            pipeline=pipeline, logs=(), verdict=Judgement("", ()), parameters=rows, search=search, misfit=spread.misfit
-        )
-    return Identification(
-        pipeline=pipeline,
-        logs=(),
-        verdict=Judgement("", ()),
-        parameters=tuple(_rows(findings, truth)),
-        search=search,
-        misfit=spread.misfit,
-        check=check,
-        posterior=posterior,
-        widening=findings.widening,
-    )
+        return replace(document, parameters=tuple(map(_without_interval, rows)))
+    return replace(document, posterior=posterior, widening=findings.widening)
 
 
 def _rows(findings: Findings, truth: Mapping[str, float]) -> list[Estimate]:
@@ -267,17 +253,18 @@ def _predicted(document: Identification, inputs: Inputs, fit: Fit) -> Identifica
     models: dict[str, Mapping[str, float]] = {"identified": fit.values, **_without_delays(fit), "nominal": nominal}
     samples = prediction.samples(problem, models, config.settle_s)
     horizons = [round(share * config.horizon_s, 3) for share in _HORIZONS]
-    runs, columns, long = free_runs(fit, inputs.episodes, inputs.fitted, config, models)
+    found = prediction.errors(problem, samples, list(models), config.settle_s, horizons)
+    measured = positions(inputs.model, inputs.units)
+    errors = [row for s in horizons for row in scores([f for f in found if f.horizon_s == s], measured)]
+    drawn = {name: values for name, values in models.items() if name != "nominal"}
+    columns, long = free_runs(fit, inputs.episodes, inputs.fitted, config, drawn)
     return replace(
         document,
         samples=samples,
         free=columns,
         replays={**replays(problem, fit.values, config.settle_s, "ahead"), **long},
         settle_s=config.settle_s,
-        prediction=tuple(prediction.errors(problem, samples, list(models), config.settle_s, horizons)),
-        free_run=tuple(runs),
-        segments=problem.segments,
-        sigma=dict(zip(prediction.labels(problem), (s for _, s, _ in problem.fields), strict=True)),
+        errors=tuple(errors),
     )
 
 
@@ -301,8 +288,8 @@ def free_runs(
     fitted: int,
     config: IdentifyConfig,
     models: Mapping[str, Any],
-) -> tuple[list[FreeRun], dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Simulate the held-out part of each log in one run; return its errors, its columns, and its commands and starts.
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Simulate the held-out part of each log in one run; return its columns, and its commands and starts.
 
     Args:
         fitted: Number of fitted logs; the later ones are held out whole.
@@ -314,12 +301,11 @@ def free_runs(
     # Take the held-out part of each log that is long enough, each to its own end.
     held_out = [Span(r, split, False) for r, split in enumerate(splits) if ends[r] - split > least_s]
     if not held_out or not config.free_run_s:
-        return [], {}, {}
+        return {}, {}
     lengths_s = [min(config.free_run_s, ends[s.recording] - s.begin_s) for s in held_out]
     problem = estimate.windows.recut(held_out, max(lengths_s), ends_s=lengths_s)
     columns = prediction.samples(problem, models, config.settle_s)
-    rows = prediction.free_runs(columns, prediction.labels(problem), list(models), config.settle_s)
-    return rows, columns, replays(problem, estimate.values, config.settle_s, "free")
+    return columns, replays(problem, estimate.values, config.settle_s, "free")
 
 
 def _compared(document: Identification, inputs: Inputs, fit: Fit, parts: Sequence[HeldOutPart]) -> Identification:
@@ -337,7 +323,7 @@ def lack(document: Identification, fits: Fits) -> Lack:
     """Return what a model lacks: by residuals far above the noise, another direction of gravity, and free runs.
 
     Args:
-        document: With samples, free runs and the tried terms.
+        document: With samples, errors on held-out data and the tried terms.
     """
     inputs, fit = fits.inputs, fits.estimate
     measured, chosen = positions(inputs.model, inputs.robot.units), [*(document.terms or ())]
@@ -376,7 +362,7 @@ def lack(document: Identification, fits: Fits) -> Lack:
         size = "diverges"
         if math.isfinite(error):
             size = f"is off by {with_small_unit(error, position.unit)}, {share:.1%} of its range"
-        seconds = max(r.seconds for r in document.free_run if r.held_out and r.field == position.column)
+        seconds = max(r.seconds for r in document.errors if (r.kind, r.column) == (FREE_RUN, position.column))
         reasons.append(f"in free runs of {seconds:.3g} s on held-out data {position.name} {size}")
     return Lack(tuple(reasons), flags, unexplained)
 
@@ -449,17 +435,16 @@ def largest_residual(
 
 def farthest_run(document: Identification, positions: Sequence[Position]) -> tuple[Position, float, float] | None:
     """Return the position whose free runs have the largest error as a share of its range, the error, and the share."""
-    errors = [(p, error) for p in positions if (error := mean_error(document.free_run, p)) is not None]
+    errors = [(p, error) for p in positions if (error := mean_error(document, p)) is not None]
     sizes = [max(float(np.ptp(document.samples[f"{p.column}_measured"])), 1e-300) for p, _ in errors]
     rows = [(p, error, error / size) for (p, error), size in zip(errors, sizes, strict=True)]
     return max(rows, key=lambda row: row[2], default=None)
 
 
-def mean_error(rows: Sequence[FreeRun], position: Position) -> float | None:
-    """Return the mean error of the identified model in a position's free runs on held-out data; None without one."""
-    own = [r for r in rows if r.held_out and (r.model, r.field) == ("identified", position.column)]
-    errors = [number(r.rmse, math.inf) for r in own]
-    return float(np.mean(errors)) if errors else None
+def mean_error(document: Identification, position: Position) -> float | None:
+    """Return the mean error of a position in free runs on held-out data; None without one."""
+    errors = [row.error for row in document.errors if (row.kind, row.column) == (FREE_RUN, position.column)]
+    return float(np.mean([math.inf if e is None else e for e in errors])) if errors else None
 
 
 def _judged(
@@ -477,8 +462,7 @@ def _judged(
         set_by_user: Parameters whose bounds the user has set.
     """
     fit, measured = findings.fit, positions(findings.fit.problem.model, inputs.units)
-    rows = scores(document.prediction, measured)
-    above = [str(row) for row in sorted(document.compared, key=lambda r: -(r.ratio or 0.0)) if row.exceeded]
+    above = [str(row) for row in document.judged if row.exceeded]
     # A fault in fitted data changes no held-out error, so it does not change the status; it may be why nothing else is
     # explained.
     worst = worst_second(document.samples, measured, document.settle_s)
@@ -486,7 +470,7 @@ def _judged(
     if alone and lacks.unexplained:
         lacks = replace(lacks, reasons=(fault, *lacks.reasons))
     judged = verdict.judge(
-        rows,
+        document.held_out,
         fit.problem.table,
         findings.x,
         findings.spread,
@@ -507,7 +491,7 @@ def _judged(
     reasons = tuple(dict.fromkeys([*why, fault] if fault else why))
     parameters = document.parameters if status == ACCEPTED else tuple(map(_doubted, document.parameters))
     judgement = Judgement(status, reasons, flags)
-    return replace(document, verdict=judgement, parameters=parameters, held_out=tuple(rows), worst=worst)
+    return replace(document, verdict=judgement, parameters=parameters, worst=worst)
 
 
 def _fault(worst: WorstSecond | None, document: Identification) -> tuple[str, bool]:

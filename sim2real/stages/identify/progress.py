@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sim2real.artifacts.identification import Estimate, Identification, Judgement, Search
+from sim2real.artifacts.identification import Estimate, Identification, Judgement
 from sim2real.artifacts.progress import write_progress
 from sim2real.artifacts.run import OpenStage
 from sim2real.identification.fit import as_numbers
@@ -110,7 +110,6 @@ class Best:
             logs=self.inputs.sources(self.folder.parent),
             verdict=Judgement("not finished", (reason,), self.again),
             parameters=tuple(rows),
-            search=Search(loss=self.loss, done=self.done),
         ).write(self.folder / PARTIAL)
 
 

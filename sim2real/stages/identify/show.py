@@ -34,10 +34,8 @@ def show(identification: Identification, following: str = "") -> None:
         print(artifact_table(identification.recordings_table().without("s.e.")))
     if identification.tried:
         print(artifact_table(tried_table(identification.tried)))
-    if identification.held_out:
-        print(artifact_table(identification.held_out_table().without("no better than")))
-    if (compared := identification.compared_table()).rows:
-        print(artifact_table(compared, _MOST_ROWS))
+    if identification.errors:
+        print(artifact_table(identification.errors_table(), _MOST_ROWS))
     if identification.links:
         print(artifact_table(links_table(identification.links)))
     if len(verdict.reasons) > 1:
@@ -50,11 +48,10 @@ def show(identification: Identification, following: str = "") -> None:
 
 def expected_error(identification: Identification) -> str:
     """Return the expected errors of the joint with the largest one beside its noise, as text."""
-    expected, sigma = identification.expected_error, identification.sigma
+    expected = identification.expected_error
     if not expected:
         return "unknown, as there are too few held-out parts, or a prediction of one diverged"
-    worst = max(expected, key=lambda e: e.error / sigma.get(e.column, 1.0)).column
-    own, joints = [e for e in expected if e.column == worst], {e.column for e in expected}
+    own, joints = [e for e in expected if e.column == expected[0].column], {e.column for e in expected}
     which = f", the worst of {len(joints)} joints" if len(joints) > 1 else ""
     return f"{own[0].name} " + ", ".join(f"{with_small_unit(e.error, e.unit)} {e.how}" for e in own) + which
 
