@@ -109,7 +109,7 @@ def test_every_command_has_help(capsys, command):
         (["record", "pendulum", "surplus"], "surplus"),
         (["info", "no_such_log.mcap"], "no_such_log.mcap"),
         (["validate", "--parameters", "run"], "write its value without --parameters"),
-        (["validate", "--no-force", "--mjcf=robot.xml", "--log", "b.npz"], "unknown flag --mjcf. Available: --log,"),
+        (["validate", "--no-json", "--mjcf=robot.xml", "--log", "b.npz"], "unknown flag --mjcf. Available: --log,"),
         (["report", "no_such"], "Pipelines: "),
         (["report", "--rerun", "pendulum"], "sim2real report pendulum --rerun"),
     ],

@@ -34,7 +34,7 @@ _SHOWN: Mapping[str, str] = {
     "RobotFlags": "mjcf joints parameter mapping unit rate_hz",
     "DoctorConfig": "policy log mjcf contract sim out bundle json",
     "CheckConfig": "log plan bounds fix json runs",
-    "ValidateConfig": "parameters log force json",
+    "ValidateConfig": "parameters log json",
     "ImportConfig": "files mapping pipeline mjcf joints unit calibration rate_hz out",
     "ReportConfig": "targets rerun out json runs",
 }

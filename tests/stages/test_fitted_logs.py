@@ -11,7 +11,7 @@ from sim2real.artifacts.run import Source
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
 from sim2real.identification.model import Channel
-from sim2real.stages.shared.identification import require_apart, require_new
+from sim2real.stages.shared.identification import require_apart, was_fitted
 
 CHANNELS = (
     Channel("position", "velocity", 0.001, 0.01, index=0, label="a"),
@@ -66,21 +66,17 @@ def identified(samples=True):
         (FITTED[:10], "short", None),
     ],
 )
-def test_what_was_fitted_is_refused(tmp_path, read, text, said):
+def test_what_was_fitted_is_found_again(tmp_path, read, text, said):
     logs = [log(tmp_path, "later.mcap", read, text)]
-    if said is None:
-        assert require_new(identified(), logs, MODEL, False) == []
-        return
-    with pytest.raises(UsageError, match=said) as refused:
-        require_new(identified(), logs, MODEL, False)
-    assert "--force" in refused.value.hint
-    assert said in require_new(identified(), logs, MODEL, True)[0]
+    (sentence,) = was_fitted(identified(), logs, MODEL)
+    assert (said or "") in sentence
+    assert bool(sentence) == bool(said)
 
 
 def test_an_older_file_without_columns_still_has_hashes(tmp_path):
-    with pytest.raises(UsageError, match=r"is fitted\.mcap"):
-        require_new(identified(False), [log(tmp_path, "copy.mcap", FITTED, "fitted.mcap")], MODEL, False)
-    assert require_new(identified(False), [log(tmp_path, "new.mcap", FITTED, "other")], MODEL, False) == []
+    copy, new = log(tmp_path, "copy.mcap", FITTED, "fitted.mcap"), log(tmp_path, "new.mcap", FITTED, "other")
+    found = was_fitted(identified(False), [copy, new], MODEL)
+    assert found == ["it is fitted.mcap, which these parameters were identified from", ""]
 
 
 @pytest.mark.parametrize(
@@ -93,13 +89,11 @@ def test_an_older_file_without_columns_still_has_hashes(tmp_path):
         ([("a", 0), ("a", 0)], [], "fitted twice"),
     ],
 )
-def test_a_log_is_fitted_once_or_held_out(tmp_path, fitted, held_out, said, capsys):
+def test_a_log_is_fitted_once_or_held_out(tmp_path, fitted, held_out, said):
     of = [[log(tmp_path, f"{w}{i}.mcap", motion(s), t) for i, (t, s) in enumerate(rows)]
           for w, rows in (("fitted", fitted), ("held", held_out))]  # fmt: skip
     if said is None:
-        require_apart(*of, MODEL, False)
+        require_apart(*of, MODEL)
         return
     with pytest.raises(UsageError, match=said):
-        require_apart(*of, MODEL, False)
-    require_apart(*of, MODEL, True)
-    assert said in capsys.readouterr().err
+        require_apart(*of, MODEL)

@@ -44,7 +44,6 @@ def error(log="b.mcap", size=0.004, expected=0.02, kind=AHEAD, **changes):
         ([error()] * 99 + [error("bad.mcap", 0.031, kind=FREE_RUN)], {}, False, "bad.mcap"),
         ([error(beaten_by=("hold",))], {}, False, "hold"),
         ([error()], {"refused": {"a.mcap": "it lasts 0.1 s"}}, False, "a.mcap"),
-        ([error()], {"fitted": ["b.mcap is a.mcap"]}, True, "fitted"),
         ([error(expected=None)], {}, True, "expects no error"),
     ],
 )
@@ -95,15 +94,15 @@ def test_each_log_is_scored_alone_and_a_bad_one_does_not_stop_the_others():
     pipeline, found = identification(expected=1e-6)
     good, short = (open_recording(path, pipeline) for path in LOGS)
     lacking = Recording(Path("lacking.mcap"), replace(short.episode, steps={}, outputs={}))
-    config = ValidateConfig(horizon_s=1.0, free_run_s=2.0)
-    scored = stage.score(found, pipeline, [good, lacking, short], config, {"unreadable.csv": "no columns"})
+    found = replace(found, expected_error=(*found.expected_error, ExpectedError("th", "th", "rad", FREE_RUN, 2.0, 1.0)))
+    scored = stage.score(found, pipeline, [good, lacking, short], {"unreadable.csv": "no columns"})
     assert set(scored.refused) == {"lacking.mcap", "unreadable.csv"}
     ahead = {e.source: e for e in scored.errors if e.kind == AHEAD}
     assert set(ahead) == {good.path.name, short.path.name}
     assert all(e.ratio == pytest.approx(e.error / 1e-6) for e in ahead.values())
     assert {e.seconds for e in scored.errors if e.kind == FREE_RUN} == {2.0}
     assert not scored.holds
-    (alone,) = [e for e in stage.score(found, pipeline, [good], config).errors if e.kind == AHEAD]
+    (alone,) = [e for e in stage.score(found, pipeline, [good]).errors if e.kind == AHEAD]
     assert alone.error == pytest.approx(ahead[good.path.name].error, rel=0.02)  # programs of other sizes
     with pytest.raises(UsageError, match="lacking"):
-        stage.score(found, pipeline, [lacking], config)
+        stage.score(found, pipeline, [lacking])

@@ -21,8 +21,6 @@ class IdentifyConfig(FitConfig):
     """Logs that are held out: predicted, not fitted."""
     standing: Annotated[str | None, Flag("FILE")] = None
     """Log of a robot on its feet (`record --excitation standing`), from which its load is estimated."""
-    force: bool = False
-    """Allow a log that is given twice: held out and fitted, or fitted two times."""
     settle_s: float = 0.3
     """First part of a held-out segment, to which its initial state is fitted; the rest is predicted [s]."""
     horizon_s: float = 1.0

@@ -109,7 +109,7 @@ def prepare(
     for log in (*logs, *([standing] if standing else [])):
         require_units(log, robot)
     model = measured_channels(robot.identifiable(config.max_delay_s), [log.episode for log in logs])
-    require_apart(fitted, held_out, model, config.force)
+    require_apart(fitted, held_out, model)
     episodes = [log.episode for log in fitted]
     table = table_of(model, config, episodes).with_begin(begin or {})
     config = with_length(config, model)

@@ -25,7 +25,6 @@ from sim2real.identification.segments import GRID_S, Span, on_grid
 from sim2real.robots.robot import RecordedRobot, in_world
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.load import defaults_of
-from sim2real.stages.terminal.console import note
 
 _ANY_DELAY_S = 0.1
 """The names of a model's parameters do not depend on its longest delay, so any does [s]."""
@@ -182,18 +181,10 @@ def split_of(episode: Episode, fitted: bool, config: IdentifyConfig) -> float:
 # A log that was fitted is no test of the fit.
 
 
-def require_new(
-    identification: Identification, logs: Sequence[Recording], model: IdentifiableModel, force: bool
-) -> list[str]:
-    """Return sentences about logs that the parameters were identified from; by default such a log is an error.
+def was_fitted(identification: Identification, logs: Sequence[Recording], model: IdentifiableModel) -> list[str]:
+    """Return for each log a sentence if the parameters were identified from it, else "".
 
     A copy, an import of the same file and a part of a fitted log have the same measurements.
-
-    Args:
-        force: Whether to warn, and use such logs.
-
-    Raises:
-        UsageError: A log was fitted, and ``force`` is False.
     """
     # Collect the hashes and the measurements of the fitted logs.
     rows = identification.samples
@@ -205,25 +196,22 @@ def require_new(
         segments = np.where(rows["held_out"].astype(bool), -1, rows["segment"])
         pieces = [piece for s in np.unique(segments[segments >= 0]) for piece in _pieces(read[segments == s])]
     # Compare each log with them.
-    messages = []
+    sentences = []
     for log in logs:
         if (path := paths.get(hash_of(log))) is not None:
-            messages.append(f"{log.path} is {path}, which these parameters were identified from")
+            sentences.append(f"it is {path}, which these parameters were identified from")
         elif any(_contains(_measured(log, model), piece) for piece in pieces):
-            messages.append(f"{log.path} holds measurements that these parameters were identified from")
-    return _refuse(messages, "take a log of later motion: errors there are no test of a fit", force)
+            sentences.append("it holds measurements that these parameters were identified from")
+        else:
+            sentences.append("")
+    return sentences
 
 
-def require_apart(
-    fitted: Sequence[Recording], held_out: Sequence[Recording], model: IdentifiableModel, force: bool
-) -> None:
+def require_apart(fitted: Sequence[Recording], held_out: Sequence[Recording], model: IdentifiableModel) -> None:
     """Raise an error if a log is given twice: fitted and held out, or fitted two times.
 
-    Args:
-        force: Whether to warn, and use such logs.
-
     Raises:
-        UsageError: A log is given twice, and ``force`` is False.
+        UsageError: A log is given twice.
     """
     hashes = [hash_of(log) for log in fitted]
     messages = [
@@ -237,20 +225,14 @@ def require_apart(
             whole = _measured(other, model)
             if (digest and digest == other_digest) or any(_contains(whole, p) for p in pieces):
                 messages.append(f"{log.path} is to be held out, and {other.path}, with the same measurements, fitted")
-    _refuse(messages, "name each log once: held-out errors of a fitted log are no test of the fit", force)
+    if messages:
+        hint = "name each log once: held-out errors of a fitted log are no test of the fit"
+        raise UsageError("; ".join(messages), hint=hint)
 
 
 def hash_of(log: Recording) -> str:
     """Return the SHA-256 of a log's file; "" if there is no such file."""
     return sha256(log.path) if log.path.is_file() else ""
-
-
-def _refuse(messages: list[str], hint: str, force: bool) -> list[str]:
-    if messages and not force:
-        raise UsageError("; ".join(messages), hint=f"{hint}; --force (in Python {{'force': True}}) uses it anyway")
-    for sentence in messages:
-        note(f"warning: {sentence}")
-    return messages
 
 
 def _measured(log: Recording, model: IdentifiableModel) -> np.ndarray:

@@ -15,11 +15,5 @@ class ValidateConfig:
     """parameters.json, or the folder of an identification."""
     log: Annotated[tuple[str, ...], Flag("FILE ...")] = ()
     """Later logs."""
-    horizon_s: float = 0.0
-    """Horizon of the predictions [s]; 0: that of the identification's verdict."""
-    free_run_s: float = 0.0
-    """Longest simulation from a single initial state [s]; 0: that of the identification's bounds."""
-    force: bool = False
-    """Score a log even if it was fitted."""
     json: bool = False
     """Print JSON instead of tables."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +35,7 @@ from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.load import AnyRobot, defaults_of, load_robot, robot_of
 from sim2real.stages.shared import arguments
 from sim2real.stages.shared.arguments import AnyIdentification, AnyRecording, open_recording
-from sim2real.stages.shared.identification import command, identified_robot, require_new, side_by_side, usable
+from sim2real.stages.shared.identification import command, identified_robot, side_by_side, usable, was_fitted
 from sim2real.stages.terminal.console import artifact_table, note, progress, shown
 from sim2real.stages.validate.config import ValidateConfig
 from sim2real.types import Json
@@ -57,16 +57,14 @@ class Validation(Shown):
         identified: The status of the identification.
         resting: Log -> joints that do not move in it.
         refused: Log -> why it was not scored.
-        fitted: Sentences about fitted logs, which test nothing.
     """
 
     pipeline: str
     horizon_s: float
     errors: tuple[ComparedError, ...]
     identified: str = ACCEPTED
-    resting: Mapping[str, Sequence[str]] | None = None
-    refused: Mapping[str, str] | None = None
-    fitted: Sequence[str] = ()
+    resting: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    refused: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def exceeded(self) -> tuple[ComparedError, ...]:
@@ -88,8 +86,6 @@ class Validation(Shown):
         """The result in one sentence."""
         logs = len({e.source for e in self.errors})
         which = "this log" if logs == 1 else f"these {logs} logs"
-        if self.fitted:
-            return "none: a log that was fitted is no test"
         if self.beaten:
             worst = self.beaten[0]
             return (
@@ -139,7 +135,7 @@ def run(config: ValidateConfig) -> bool:
             if len(config.log) == 1:
                 raise
             refused[path] = str(error)
-    found = score(identification, robot, logs, config, refused)
+    found = score(identification, robot, logs, refused)
     if config.json:
         rows = [{**plain(e), "ratio": e.ratio, "exceeded": e.exceeded} for e in found.errors]
         document = {**plain(found), "errors": rows, "verdict": found.verdict, "holds": found.holds}
@@ -148,9 +144,9 @@ def run(config: ValidateConfig) -> bool:
     note(f"verdict: {found.verdict}")
     note(f"next: {_following(found, identification, robot, config)}")
     print(artifact_table(found.rows(), _SHOWN))
-    for log, joints in (found.resting or {}).items():
+    for log, joints in found.resting.items():
         note(f"{', '.join(joints)} does not move in {log}, which tests nothing about it")
-    for log, reason in (found.refused or {}).items():
+    for log, reason in found.refused.items():
         note(f"not scored: {log}: {reason}")
     if found.identified != ACCEPTED:
         note(f"the identification itself was not accepted: {found.identified}")
@@ -180,7 +176,6 @@ def validate(
     robot: AnyRobot,
     identification: AnyIdentification,
     recording: AnyRecording | Sequence[AnyRecording],
-    config: ValidateConfig | Mapping[str, Json] | None = None,
 ) -> Validation:
     """Score an identification on later recordings.
 
@@ -188,40 +183,39 @@ def validate(
         robot: The robot, or the name of its pipeline.
         identification: The identification, or its folder.
         recording: One recording that was not fitted, or several; or the paths of their logs.
-        config: A dict holds the fields that differ from the default.
     """
     robot = robot_of(robot)
     document = arguments.identification_of(identification)
     if document.pipeline != robot.name:
         raise UsageError(f"these are parameters of pipeline {document.pipeline!r}, not of {robot.name!r}")
     logs = arguments.recordings_of(recording, robot)
-    return score(document, robot, logs, arguments.config_of(config, ValidateConfig()))
+    return score(document, robot, logs)
 
 
 def score(
     identification: Identification,
     robot: RecordedRobot,
     logs: Sequence[Recording],
-    config: ValidateConfig,
     refused: Mapping[str, str] | None = None,
 ) -> Validation:
-    """Return the errors on logs that were not fitted.
+    """Return the errors on logs that were not fitted, at the horizons of the expected errors.
 
     Args:
         refused: Log -> why it was not read.
 
     Raises:
-        UsageError: A log was fitted, no log can be scored parameters.
+        UsageError: No log can be scored: each was fitted, is too short, or lacks signals of the model.
     """
     robot, fitting = identified_robot(identification, robot)
     model = measured_channels(robot.identifiable(fitting.max_delay_s), [log.episode for log in logs])
     models = models_of(identification, model)
     refused = dict(refused or {})
-    fitted = require_new(identification, logs, model, config.force)
-    # Keep the logs that hold the model's signals and are long enough for a window.
+    # Keep the logs that were not fitted, hold the model's signals and are long enough for a window.
     good, lengths = [], []
-    for log in logs:
+    for log, fitted in zip(logs, was_fitted(identification, logs, model), strict=True):
         try:
+            if fitted:
+                raise UsageError(f"{fitted}: errors there are no test of a fit")
             check_log(log.episode, model)
             begin, end = usable(log.episode, fitting)
             if end - begin - fitting.settle_s < _LEAST_S:
@@ -236,8 +230,8 @@ def score(
 
     # Predict windows of the horizon, and a free run of each log; a short log has shorter ones.
     limits = {(e.column, e.kind): e for e in identification.expected_error}
-    horizon_s = config.horizon_s or next((row.seconds for row in identification.held_out), fitting.horizon_s)
-    run_s = config.free_run_s or max((e.seconds for k, e in limits.items() if k[1] == FREE_RUN), default=_FREE_RUN_S)
+    horizon_s = next((row.seconds for row in identification.held_out), fitting.horizon_s)
+    run_s = max((e.seconds for k, e in limits.items() if k[1] == FREE_RUN), default=_FREE_RUN_S)
     errors, measured = list[ComparedError](), positions(model, robot.units)
     kinds: tuple[tuple[ErrorKind, float], ...] = ((AHEAD, horizon_s), (FREE_RUN, run_s))
     with progress(None, "validate: simulate"):
@@ -269,7 +263,7 @@ def score(
     ordered = tuple(sorted(errors, key=lambda e: -(e.ratio or 0.0)))
     resting = {log: joints for log, joints in resting.items() if joints}
     status = identification.verdict.status
-    return Validation(robot.name, horizon_s, ordered, status, resting, refused, fitted)
+    return Validation(robot.name, horizon_s, ordered, status, resting, refused)
 
 
 def models_of(identification: Identification, model: IdentifiableModel) -> dict[str, dict[str, float]]:
