@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from sim2real import pytree
-from sim2real.artifacts.files import number, plain, to_json
+from sim2real.artifacts.files import plain, to_json
 from sim2real.artifacts.run import newest
 from sim2real.artifacts.summary import ArtifactTable, Shown
 from sim2real.errors import NotInstalled, Sim2RealError, UsageError
@@ -60,7 +60,6 @@ class SignalCoverage:
         fastest: The highest speed of a joint.
         moving: Share of the time in which a joint moves.
         forward: Share of that time in which its position increases.
-        reversals: Number of its changes of direction.
     """
 
     name: str
@@ -70,7 +69,6 @@ class SignalCoverage:
     fastest: float | None = None
     moving: float = 0.0
     forward: float = 0.0
-    reversals: int = 0
 
 
 @dataclass(frozen=True)
@@ -117,11 +115,11 @@ class Coverage:
         sampled = f"{self.samples} samples in {self.duration_s:.1f} s, {self.rate_hz:.4g} Hz, gaps: {gaps}"
         rows = []
         for s in (*self.joints, *self.commands):
-            of_joint = ["", "", "", ""]
+            of_joint = ["", "", ""]
             if s.fastest is not None:
-                of_joint = [f"{s.fastest:.3g}", f"{s.moving:.0%}", f"{s.forward:.0%}", s.reversals]
+                of_joint = [f"{s.fastest:.3g}", f"{s.moving:.0%}", f"{s.forward:.0%}"]
             rows.append([s.name, f"{s.low:.3g} to {s.high:.3g} {s.unit}".rstrip(), *of_joint])
-        table = ArtifactTable(("signal", "range", "highest speed", "in motion", "of it upwards", "reversals"), rows)
+        table = ArtifactTable(("signal", "range", "highest speed", "in motion", "of it upwards"), rows)
         print(f"{pairs({self.name: sampled})}\n\n{artifact_table(table)}\n")
 
 
@@ -131,7 +129,6 @@ class ParameterCheck:
 
     Attributes:
         standard_error_per_minute: Standard error to expect from one minute of such data.
-        determined: ``alone``, or ``in a group`` of which only combinations are determined.
         excite: The motion that determines it, as text.
     """
 
@@ -139,7 +136,6 @@ class ParameterCheck:
     unit: str
     nominal: float | None
     standard_error_per_minute: float
-    determined: str
     excite: str = ""
 
     @property
@@ -153,19 +149,13 @@ class Checked(Shown):
     """Which parameters recordings, or a planned one, determine.
 
     Attributes:
-        source: ``log``, or ``planned excitation``.
-        segments: Number of simulated segments.
-        segment_s: Length of a segment [s].
         undetermined: Groups of parameters; only combinations of the parameters in a group are determined.
         messages: A sentence for each group.
         following: The command to run next.
     """
 
     pipeline: str
-    source: str
     recordings: tuple[Coverage, ...]
-    segments: int
-    segment_s: float
     undetermined: tuple[tuple[str, ...], ...]
     messages: tuple[str, ...]
     parameters: tuple[ParameterCheck, ...]
@@ -177,14 +167,18 @@ class Checked(Shown):
         return not self.undetermined
 
     @property
+    def in_groups(self) -> tuple[str, ...]:
+        """The parameters that the data does not determine alone."""
+        return tuple(dict.fromkeys(name for group in self.undetermined for name in group))
+
+    @property
     def verdict(self) -> str:
         """The result in one sentence."""
         if self.undetermined:
-            names = ", ".join(dict.fromkeys(n for group in self.undetermined for n in group))
+            names = ", ".join(self.in_groups)
             return f"do not identify yet: some of {names} would be guesses; --fix NAME VALUE holds a known one"
-        several = self.source != PLANNED and len(self.recordings) > 1
-        what = "this plan determines" if self.source == PLANNED else "this log determines"
-        return f"{'these logs determine' if several else what} every parameter"
+        one = "this plan determines" if self.recordings[0].name == PLANNED else "this log determines"
+        return f"{one if len(self.recordings) == 1 else 'these logs determine'} every parameter"
 
     @property
     def recommendation(self) -> tuple[str, ...]:
@@ -192,11 +186,10 @@ class Checked(Shown):
         have_s, several = sum(r.duration_s for r in self.recordings), len(self.recordings) > 1
         texts = [f"only {have_s:.1f} s: too little to fit one part and check on another"] if have_s < _SHORT_S else []
         texts += [f"{r.name}: {text}" if several else text for r in self.recordings for text in r.problems()]
-        names = {n for group in self.undetermined for n in group}
-        if motions := dict.fromkeys(p.excite for p in self.parameters if p.excite and p.name in names):
+        if motions := dict.fromkeys(p.excite for p in self.parameters if p.excite and p.name in self.in_groups):
             texts.append(f"record instead: {'; '.join(motions)}")
         # How long to record follows from the parameter with the largest standard error.
-        alone = [(p.percent_of_nominal, p.name) for p in self.parameters if p.determined == "alone"]
+        alone = [(p.percent_of_nominal, p.name) for p in self.parameters if p.name not in self.in_groups]
         if known := [(percent, name) for percent, name in alone if percent]:
             percent, worst = max(known)
             seconds = 60.0 * (percent / (100 * _GOAL)) ** 2
@@ -208,15 +201,19 @@ class Checked(Shown):
 
     def about(self) -> dict[str, Json]:
         """Return name -> value of the main figures."""
-        figures = {"pipeline": self.pipeline, "source": self.source, "determined": "yes" if self.determined else "no"}
-        return {**figures, "why": "; ".join([*self.messages, *self.recommendation]), "next": self.following}
+        why = "; ".join([*self.messages, *self.recommendation])
+        return {"pipeline": self.pipeline, "verdict": self.verdict, "why": why, "next": self.following}
 
     def rows(self) -> ArtifactTable:
         """Return a row for each parameter."""
         headers = ("parameter", "nominal", "s.e. from a minute", "unit", "of nominal", "determined")
-        share = lambda p: None if p.percent_of_nominal is None else f"{p.percent_of_nominal:.2g} %"  # noqa: E731
         rows = [
-            [p.name, p.nominal, p.standard_error_per_minute, p.unit, share(p), p.determined] for p in self.parameters
+            [
+                *(p.name, p.nominal, p.standard_error_per_minute, p.unit),
+                None if p.percent_of_nominal is None else f"{p.percent_of_nominal:.2g} %",
+                "in a group" if p.name in self.in_groups else "alone",
+            ]
+            for p in self.parameters
         ]
         return ArtifactTable(headers, rows)
 
@@ -302,8 +299,7 @@ def check(
         following = f"record such a motion, or hold a known value: {following} --fix {checked.undetermined[0][0]} VALUE"
     elif planned:
         following = f"sim2real record {robot.name}"
-    source = PLANNED if planned else "log"
-    return replace(checked, pipeline=robot.name, source=source, recordings=covered, following=following)
+    return replace(checked, pipeline=robot.name, recordings=covered, following=following)
 
 
 def find_logs(robot: RecordedRobot, config: CheckConfig) -> dict[str, Episode]:
@@ -416,8 +412,8 @@ def speed(t_s: np.ndarray, position: np.ndarray) -> np.ndarray:
     return np.gradient(np.asarray(position, np.float64), times[0] + np.concatenate([[0.0], np.cumsum(steps)]))
 
 
-def motion_of(t_s: np.ndarray, position: np.ndarray) -> tuple[float, float, int]:
-    """Return the share of the time in motion, the share of it upwards, and the number of reversals of a joint.
+def motion_of(t_s: np.ndarray, position: np.ndarray) -> tuple[float, float]:
+    """Return the share of the time in motion, and the share of it upwards, of a joint.
 
     Speeds are those of positions averaged over 30 ms, so that the noise of fast samples does not hide slow motion;
     noise, glitches and quantisation are no motion.
@@ -440,15 +436,14 @@ def motion_of(t_s: np.ndarray, position: np.ndarray) -> tuple[float, float, int]
         noise /= width * max(float(np.median(np.diff(t_s))), 1e-9)
         t_s, position = (np.convolve(values, mean, "valid") for values in (t_s - t_s[0], position))
         if not np.ptp(np.quantile(position, [0.005, 0.995])) > least:
-            return 0.0, 0.0, 0
+            return 0.0, 0.0
     velocity = speed(t_s, position)
     # Compare with the 99 % quantile: a rare spike must not make the other speeds count as standing still.
     still = max(_STILL * float(np.quantile(np.abs(velocity), 0.99)), 3.0 * noise) if velocity.size else 0.0
     fast = np.abs(velocity) > still
     if not fast.any():
-        return 0.0, 0.0, 0
-    signs = np.sign(velocity[fast])
-    return float(fast.mean()), float((signs > 0).mean()), int((np.diff(signs) != 0).sum())
+        return 0.0, 0.0
+    return float(fast.mean()), float((velocity[fast] > 0).mean())
 
 
 def determine(
@@ -461,17 +456,9 @@ def determine(
     spans, length_s = cut_segments(episodes, config)
     problem = Problem(model, episodes, spans, length_s, config, parameters)
     found = what_is_determined(problem, problem.linearise(problem.table.start()))
-    grouped = {name for group in found.undetermined for name in group}
-    errors = found.standard_error_per_minute.values()
-    rows = [
-        ParameterCheck(
-            *(c.name, c.unit, c.nominal, number(error)),
-            *("in a group" if c.name in grouped else "alone", c.excite),
-        )
-        for c, error in zip(problem.table.columns, errors, strict=True)
-    ]
-    groups = (found.undetermined, found.messages)
-    return Checked("", "log", (), problem.segments, length_s, *groups, tuple(rows))
+    errors = found.standard_error_per_minute
+    rows = [ParameterCheck(c.name, c.unit, c.nominal, errors[c.name], c.excite) for c in problem.table.columns]
+    return Checked("", (), found.undetermined, found.messages, tuple(rows))
 
 
 def cut_segments(episodes: Sequence[Episode], config: IdentifyConfig) -> tuple[list[Span], float]:
