@@ -31,8 +31,6 @@ FORMAT = 5
 PARAMETERS, PREDICTIONS, FREE_RUNS, REPLAYS = "parameters.json", "predictions.npz", "free_runs.npz", "replays.npz"
 ROUND_TRIP = "round_trip_delay"
 """Name of the sum of all delays."""
-MODELS = ("identified", "no delay", "nominal")
-"""Models that predict: with the estimates, fitted without delays, and with the nominal values."""
 _COLUMNS = ("t", "into", "segment", "recording", "held_out")
 _NO_LIMIT = 1e6
 """Value of an absent limit: ``worlds.drive_terms.NO_LIMIT``, whose module takes a second to import."""
@@ -83,7 +81,7 @@ class Judgement:
     Attributes:
         status: ``accepted``, ``record again``, ``change the model`` or ``not finished``; "" before it is judged.
         reasons: Sentences; the first one decided.
-        next: The command to run next; "": there is none.
+        next: The command to run next, or what else to do; "" before it is judged.
     """
 
     status: str
@@ -285,18 +283,13 @@ def compared_table(rows: Sequence[ComparedError], source: str) -> ArtifactTable:
     models = list(dict.fromkeys(model for row in rows for model in row.baselines))
     cells = [
         [
-            *(r.name, r.source, f"{r.seconds:.3g} s {'ahead' if r.kind == AHEAD else r.kind}"),
-            *(
-                math.inf if r.error is None else r.error,
-                r.expected,
-                "" if r.ratio is None else f"{r.ratio:.2f}",
-                r.unit,
-            ),
-            *(r.baselines.get(m, "") for m in models),
+            *(r.name, r.source, f"{r.seconds:.3g} s {'ahead' if r.kind == AHEAD else r.kind}", r.unit),
+            *(r.baselines.get(m) for m in models),
+            *(math.inf if r.error is None else r.error, r.expected, "" if r.ratio is None else f"{r.ratio:.2f}"),
         ]
         for r in rows
     ]
-    return ArtifactTable(("joint", source, "predicted", "error", "expected", "ratio", "unit", *models), cells)
+    return ArtifactTable(("joint", source, "predicted", "unit", *models, "error", "expected", "ratio"), cells)
 
 
 _WINDOW_S = 1.0
@@ -447,7 +440,8 @@ class Identification(Shown):
         world: Name of the simulated world; None for the robot's own.
         posterior: Distribution from which training draws robots; None after an interrupted search.
         samples: Columns of the segments ``(N,)``: ``t``, ``into`` (since the segment's start) [s], ``segment``,
-            ``recording``, ``held_out``, and ``FIELD_measured`` and ``FIELD_MODEL`` of each field.
+            ``recording``, ``held_out``, and ``FIELD_measured`` and ``FIELD_MODEL`` of each field, of the
+            models ``identified``, ``no delay`` (fitted without delays) and ``nominal``.
         free: The same columns of the free runs; empty without free runs.
         replays: Initial states and commands of held-out segments and free runs.
         timing: Timing of the first recording, from which training draws its delays; None if only the estimates exist.
@@ -517,6 +511,15 @@ class Identification(Shown):
         compared = sorted((e for e in self.errors if e.ratio is not None), key=lambda e: -(e.ratio or 0.0))
         return (*compared, *(e for e in self.held_out if e.ratio is None))
 
+    def outlook(self) -> str:
+        """Return the expected errors of the joint with the largest one beside its noise, as text."""
+        if not self.expected_error:
+            return "unknown, as there are too few held-out parts, or a prediction of one diverged"
+        first, joints = self.expected_error[0], {e.column for e in self.expected_error}
+        own = [f"{with_small_unit(e.error, e.unit)} {e.how}" for e in self.expected_error if e.column == first.column]
+        which = f", the worst of {len(joints)} joints" if len(joints) > 1 else ""
+        return f"{first.name} {', '.join(own)}{which}"
+
     def expected_of(self, column: str, kind: ErrorKind) -> ExpectedError | None:
         """Return the expected error of a position; None if there is none."""
         return next((e for e in self.expected_error if (e.column, e.kind) == (column, kind)), None)
@@ -544,10 +547,6 @@ class Identification(Shown):
     def recordings(self) -> list[int]:
         """Numbers of the recordings in ``samples``."""
         return np.unique(self.samples["recording"]).tolist() if self.samples else []
-
-    def models(self, name: str) -> list[str]:
-        """Return the models that predict a field."""
-        return [m for m in MODELS if f"{name}_{m}" in self.samples]
 
     def disjoint(self) -> np.ndarray:
         """Return a mask ``(N,)`` of the samples in segments that do not overlap an earlier one."""

@@ -1,11 +1,10 @@
 """The section of an identification: verdict and worst second, parameters, errors, predictions."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
 
 from sim2real.artifacts.files import number as as_number
 from sim2real.artifacts.identification import (
@@ -37,7 +36,7 @@ from sim2real.view.blocks import (
     sentence,
 )
 from sim2real.view.panels import Line, Panel, compared, over_time, with_gaps, with_unit
-from sim2real.view.style import BLUE, GREEN, GRID, INK, MUTED, ORANGE, new_figure, styled, to_svg
+from sim2real.view.style import BLUE, INK, ORANGE, new_figure, styled, to_svg
 
 _TITLES: dict[str, tuple[Tone, str]] = {
     "accepted": ("good", "Accepted"),
@@ -47,11 +46,8 @@ _TITLES: dict[str, tuple[Tone, str]] = {
 }
 _MOST_COMPARED = 12
 """Rows of errors beside the expected ones that are not folded."""
-_STRONG = 0.9
-"""Correlations above this are listed."""
 _MAX_PANELS = 6
 _NUMBERS = ("estimate", "nominal", "standard_error", "low95", "high95", "lower", "upper", "truth")
-_KINDS = ("relative to nominal", "position between the bounds [%]", "time [ms]")
 _AROUND_S = 1.0
 """Time that is drawn before and after the worst second [s]."""
 _GOAL = "told"
@@ -66,12 +62,11 @@ def identify_section(artifact: StageFolder) -> PageSection:
     result = Identification.load(artifact.folder)
     blocks = [
         *_expected(result),
-        *_parameters(result),
+        _parameter_table(result.parameters),
         *_recordings(result),
         *tried_blocks(result),
         *link_blocks(result.links),
-        *([_prediction_figure(result)] if result.free or result.samples else []),
-        *_correlation(result),
+        *_free_runs(result),
         *about(artifact),
     ]
     lead = "Dynamics and delays from the log, each with its 95 % interval."
@@ -80,16 +75,17 @@ def identify_section(artifact: StageFolder) -> PageSection:
 
 
 def identify_banner(result: Identification) -> Banner | None:
-    """Return the verdict, its deciding reason and the next command; None before it is judged."""
+    """Return the verdict, its deciding reason, the expected error and what to do next; None before it is judged."""
     status = result.verdict.status
     if not status:
         return None
     tone, title = _TITLES.get(status, ("doubt", status[:1].upper() + status[1:]))
     if status == "accepted" and result.worst is not None and result.worst.unexplained:
         tone, title = "doubt", "Accepted, but the model does not explain one second"
-    reasons = [sentence(r, [h.name for h in result.held_out]) for r in result.verdict.reasons]
-    reasons[1:1] = [f"next: {result.verdict.next}"] if result.verdict.next else []
-    return Banner(tone, title, reasons)
+    first, *others = [sentence(r, [h.name for h in result.held_out]) for r in result.verdict.reasons] or [""]
+    following = f"Next: {result.verdict.next}" if result.verdict.next else ""
+    reasons = [first, f"Expected error: {result.outlook()}.", following, *others]
+    return Banner(tone, title, [reason for reason in reasons if reason])
 
 
 def _tiles(result: Identification) -> Iterator[Tile]:
@@ -152,17 +148,6 @@ def worst_figure(result: Identification, name: str) -> FigureBlock | None:
 # -- parameters
 
 
-def _parameters(result: Identification) -> list[Block]:
-    """Return table and figure of the parameters, and what the data determines."""
-    bounded = [e for e in result.parameters if e.verdict == "at a bound"]
-    active = f"At a bound: {', '.join(_at_bound(e) for e in bounded)}." if bounded else "No estimate is at a bound."
-    caption = f"Each estimate with its 95 % interval within the bounds of the search. {active}"
-    return [
-        _parameter_table(result.parameters),
-        FigureBlock(intervals_svg(result.parameters, "identify-intervals"), caption),
-    ]
-
-
 def _parameter_table(estimates: Sequence[Estimate]) -> TableBlock:
     estimates = [e for e in estimates if not e.absent]
     with_truth = any(e.truth is not None for e in estimates)
@@ -193,85 +178,12 @@ def in_readable_unit(e: Estimate) -> Estimate:
     return replace(e, unit="ms", **{n: None if v is None else 1e3 * v for n, v in scaled.items()})
 
 
-def _at_bound(e: Estimate) -> str:
-    if e.lower is None or e.upper is None:
-        return e.name
-    upper = abs(e.upper - e.estimate) < abs(e.estimate - e.lower)
-    readable = in_readable_unit(e)
-    bound = readable.upper if upper else readable.lower
-    return f"{e.name} (the {'upper' if upper else 'lower'}, {number(bound)} {pretty_unit(readable.unit)})"
-
-
 def _error(e: Estimate) -> str:
     if e.truth is None:
         return MISSING
     if not e.truth:
         return number(e.estimate - e.truth, 2)
     return f"{100 * (e.estimate - e.truth) / abs(e.truth):+.1f} %".replace("-", "\u2212")
-
-
-def intervals_svg(estimates: Sequence[Estimate], name: str) -> str:
-    """Draw each estimate with its interval, its nominal value and its truth within its bounds."""
-    groups = [(kind, g) for kind in _KINDS if (g := [e for e in estimates if _kind(e) == kind])]
-    with styled():
-        figure = new_figure(0.7 + 0.3 * len(estimates) + 0.45 * len(groups), style.PHONE_IN)
-        grid = figure.subplots(len(groups), 1, squeeze=False, height_ratios=[len(g) + 0.6 for _, g in groups])
-        for (kind, group), axes in zip(groups, grid[:, 0], strict=True):
-            _inside_bounds(axes, group, kind)
-            axes.set_yticks(range(len(group)), [e.name for e in group])
-            axes.set_ylim(len(group) - 0.4, -0.6)
-            axes.grid(False, axis="y")
-            axes.tick_params(axis="y", length=0)
-        entries = [
-            Line2D([], [], color=BLUE, marker="o", ms=5.5, lw=3, label="estimate, 95 %"),
-            Line2D([], [], color=GRID, marker="|", mec=MUTED, ms=8, lw=4, label="bounds"),
-            Line2D([], [], color=ORANGE, marker="s", mfc="none", ms=5.5, lw=0, label="nominal"),
-        ]
-        if any(e.truth is not None for e in estimates):
-            entries.append(Line2D([], [], color=GREEN, marker="D", ms=5, lw=0, label="truth"))
-        style.legend_above(figure, entries)
-        names = ", ".join(e.name for e in estimates)
-        return to_svg(figure, name, f"Estimates with 95 percent intervals, bounds and nominal values of {names}")
-
-
-def _kind(e: Estimate) -> str:
-    if e.unit == "s":
-        return _KINDS[2]
-    values = [v for v in (e.nominal, e.estimate, e.lower, e.truth) if v is not None]
-    return _KINDS[0] if e.nominal is None or e.lower is None or min(values) > 0 else _KINDS[1]
-
-
-def _inside_bounds(axes: Axes, group: Sequence[Estimate], kind: str) -> None:
-    """Draw estimates within their bounds: relative to nominal on a log axis, as a share of the bounds, or in ms."""
-    for row, e in enumerate(group):
-        at = _placed(e, kind)
-        if e.lower is not None and e.upper is not None:
-            bounds = [at(e.lower), at(e.upper)]
-            axes.plot(bounds, [row, row], color=GRID, marker="|", mec=MUTED, ms=8, lw=4, zorder=1)
-        if e.low95 is not None and e.high95 is not None:
-            axes.plot([at(e.low95), at(e.high95)], [row, row], color=BLUE, lw=3, zorder=3)
-        axes.plot(at(e.estimate), row, color=BLUE, marker="o", ms=5.5, zorder=4)
-        if e.nominal is not None:
-            axes.plot(at(e.nominal), row, color=ORANGE, marker="s", mfc="none", ms=5.5, zorder=5)
-        if e.truth is not None:
-            axes.plot(at(e.truth), row, color=GREEN, marker="D", ms=4, zorder=6)
-    # Use a logarithmic axis for positive values relative to nominal.
-    values = [v for e in group for v in (e.lower, e.estimate, e.truth, e.nominal) if v is not None]
-    if kind == _KINDS[0] and min(values, default=0.0) > 0:
-        axes.set_xscale("log")
-        style.plain_log(axes.xaxis)
-    axes.set_xlabel(kind)
-
-
-def _placed(e: Estimate, kind: str) -> Callable[[float], float]:
-    """Return the function from a parameter's value to its place on the group's axis."""
-    if kind == _KINDS[2]:
-        return lambda v: 1e3 * v
-    if kind == _KINDS[0]:
-        return lambda v: v / (e.nominal or abs(e.estimate) or 1.0)
-    low = e.lower if e.lower is not None else min(e.estimate, 0.0)
-    high = e.upper if e.upper is not None else low + 1.0
-    return lambda v: 100.0 * (v - low) / ((high - low) or 1.0)
 
 
 def _recordings(result: Identification) -> list[Block]:
@@ -288,19 +200,6 @@ def tried_blocks(result: Identification) -> list[Block]:
     """Return the table of the tried terms; nothing if none was tried."""
     caption = "Optional terms: root mean square error on held-out parts, in deviations of a measurement"
     return [TableBlock.of(caption, tried_table(result.tried))] if result.tried else []
-
-
-def _correlation(result: Identification) -> list[Block]:
-    """Return the strong correlations, of which the data determines only combinations."""
-    if result.posterior is None:
-        return []
-    names, deviations = result.posterior.names, np.sqrt(np.diag(result.posterior.covariance))
-    matrix = result.posterior.covariance / np.maximum(np.outer(deviations, deviations), 1e-300)
-    pairs = [(names[j], names[i], float(matrix[i, j])) for i in range(len(names)) for j in range(i)]
-    strong = sorted((p for p in pairs if abs(p[2]) > _STRONG), key=lambda p: -abs(p[2]))
-    caption = f"Correlations beyond ±{_STRONG:g}: the data hardly separates the two estimates"
-    rows = [[a, b, fixed(value, 2)] for a, b, value in strong]
-    return [TableBlock(caption, ("parameter", "and", "correlation"), rows, (1,), folded=True)] if rows else []
 
 
 # -- delays of links
@@ -343,7 +242,7 @@ def _expected(result: Identification) -> list[Block]:
     """Return the expected errors, and the errors on held-out data beside them, the largest ratios first."""
     items = [f"{e.name}, {e.how}: {number(e.error, 3)} {pretty_unit(e.unit)}".strip() for e in result.expected_error]
     lead = ListBlock("The errors to expect on later data, for motion like the fitted one", items)
-    blocks: list[Block] = [lead] if items else []
+    blocks: list[Block] = [lead] if len({e.column for e in result.expected_error}) > 1 else []
     table = TableBlock.of("Errors on held-out data beside the expected errors and baselines", result.errors_table())
     judged = [row.exceeded or bool(row.beaten_by) for row in result.judged]
     tones: list[Tone] = ["bad" if worse else "good" for worse in judged]
@@ -353,17 +252,15 @@ def _expected(result: Identification) -> list[Block]:
     return [*blocks, *(block for block in (first, more) if block.rows)]
 
 
-def _prediction_figure(result: Identification) -> FigureBlock:
-    """Return the held-out data in one simulation; without one the segments, each from its own initial state."""
-    recordings = np.unique(result.free["recording"]).tolist() if result.free else result.recordings
-    if result.free:
-        svg = free_runs_svg(result, "identify-free")
-        caption = "All held-out data in one simulation, from one initial state, with the recorded commands and timing."
-    else:
-        svg = segments_svg(result, "identify-predictions")
-        caption = "Each segment is simulated from its own initial state. Shaded data is held out of the fit."
+def _free_runs(result: Identification) -> list[Block]:
+    """Return the figure of the held-out data, each recording in one simulation; nothing without free runs."""
+    if not result.free:
+        return []
+    recordings = np.unique(result.free["recording"]).tolist()
+    caption = "All held-out data in one simulation, from one initial state, with the recorded commands and timing."
     hidden = len(result.fields) * len(recordings) - len(_panels(result, recordings))
-    return FigureBlock(svg, f"{caption} {hidden} further panels are not shown." if hidden else caption)
+    caption += f" {hidden} further panels are not shown." if hidden else ""
+    return [FigureBlock(free_runs_svg(result, "identify-free"), caption)]
 
 
 def free_runs_svg(result: Identification, name: str) -> str:
@@ -389,31 +286,6 @@ def free_runs_svg(result: Identification, name: str) -> str:
         )
     label = "The held-out part of each recording, measured and simulated from one initial state"
     return over_time(panels, name, label, shade="initial state fitted here")
-
-
-def segments_svg(result: Identification, name: str) -> str:
-    """Draw measurements and predictions of segments that do not overlap; held-out data is shaded."""
-    panels = []
-    for recording, field in _panels(result, result.recordings):
-        of_recording = result.samples["recording"] == recording
-        rows = result.disjoint() & of_recording
-        t_s, segment = result.samples["t"][rows], result.samples["segment"][rows]
-        lines = [
-            Line(*with_gaps(t_s, result.samples[f"{field}_{m}"][rows], segment), _LABELS.get(m, m), m)
-            for m in ("measured", *(m for m in result.models(field) if m != "no delay"))
-        ]
-        ordered = np.flatnonzero(of_recording)[np.argsort(result.samples["t"][of_recording], kind="stable")]
-        spans = _spans(result.samples["t"][ordered], result.samples["held_out"][ordered].astype(bool))
-        title = _title(result, recording)
-        panels.append(Panel(with_unit(field, result.units), lines, title, spans, framed=("measured", "identified")))
-    label = f"Measured {', '.join(result.fields)} beside predictions of the models"
-    return over_time(panels, name, label)
-
-
-def _spans(t_s: np.ndarray, chosen: np.ndarray) -> list[tuple[float, float]]:
-    """Return the intervals over which ``chosen`` holds."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]]).astype(int)))
-    return [(float(t_s[b]), float(t_s[e - 1])) for b, e in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def _panels(result: Identification, recordings: Sequence[int]) -> list[tuple[int, str]]:

@@ -11,8 +11,9 @@ from sim2real.view.blocks import NoteBlock, PageSection
 from sim2real.view.sections import SECTIONS, iterations_sections
 
 PAGE = "report.html"
-_MOST_REASONS = 2
-"""Number of reasons in a verdict's box; the others are folded, so that a telephone's first screen has the figure."""
+_MOST_REASONS = 3
+"""Sentences in a verdict's box: why, how far off, what to do next. The others are folded, so that a telephone's first
+screen has the figure."""
 
 
 def report(run_dir: Path, out: Path | None = None) -> Path:

@@ -149,7 +149,7 @@ def _identify_tab(identification: Identification, recording: int, which: str) ->
     # Draw measurements and models, interrupted between segments.
     for quantity in identification.fields:
         curves = []
-        for model in ("measured", *(m for m in identification.models(quantity) if m != "no delay")):
+        for model in (m for m in ("measured", "identified", "nominal") if f"{quantity}_{m}" in samples):
             values = samples[f"{quantity}_{model}"].astype(np.float64)
             columns.setdefault(model, {})[quantity] = values
             series = Series(quantity, model, *interrupted(t_s, values, segment))

@@ -11,10 +11,8 @@ from typing import Any, TypeAlias, cast
 import matplotlib as mpl
 import numpy as np
 from matplotlib.artist import Artist
-from matplotlib.axis import Axis
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 # A page can redefine each colour, for dark mode and for print; a single figure has the values below. The hues are those
 # of Okabe and Ito, darkened so that text is readable on white.
@@ -180,16 +178,6 @@ def legend_above(figure: Figure, entries: Sequence[Artist]) -> None:
     """Add one legend, in a row, above all panels of a figure."""
     if entries:
         figure.legend(handles=entries, loc="outside upper left", ncols=min(6, len(entries)), borderaxespad=0.2)
-
-
-def plain_log(axis: Axis) -> None:
-    """Label a logarithmic axis with plain numbers, as powers would appear as TeX source."""
-    axis.set_major_locator(LogLocator(base=10, subs=(1.0,)))
-    low, high = axis.get_view_interval()
-    if high < 30 * low:
-        axis.set_major_locator(LogLocator(base=10, subs=(1.0, 2.0, 5.0)))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_locator(NullLocator())
 
 
 def _as_variable(match: re.Match[str]) -> str:

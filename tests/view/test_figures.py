@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from dataclasses import replace
 
 import numpy as np
 import pytest
-import synthetic_run
 from matplotlib.colors import to_hex
 from matplotlib.image import AxesImage
 from matplotlib.text import Text
-from sketches import sketched, texts
+from sketches import sketched
 
 from sim2real.artifacts.bundle import History
 from sim2real.artifacts.deployment import Deployment
@@ -48,8 +46,6 @@ def calls(artifacts, found, log):
     training = History.load(artifacts["train"].folder)
     return {
         "record": (sections.recording_svg, log),
-        "intervals": (identification.intervals_svg, found.parameters),
-        "predictions": (identification.segments_svg, found),
         "free": (identification.free_runs_svg, found),
         "training": (sections.training_svg, training),
         "deployment": (sections.deployment_svg, pairs, episode.units, 1),
@@ -124,16 +120,12 @@ def test_every_reference_in_a_figure_leads_somewhere(picture):
 
 
 def test_measured_and_predicted_are_drawn_as_they_are(drawn, found):
-    axes, rows = drawn["predictions"].axes[0], found.disjoint()
-    lines = lines_of(axes)
-    for color, model, own in (
-        (style.INK, "measured", rows), (style.BLUE, "identified", rows), (style.ORANGE, "nominal", rows)
-    ):  # fmt: skip
+    lines = lines_of(drawn["free"].axes[0])
+    for color, model in ((style.INK, "measured"), (style.BLUE, "identified")):
         ((_, dash),) = [look for look in lines if look[0] == color]
-        t_s, values = (values[np.isfinite(values)] for values in lines[color, dash])
-        at = np.unique(found.samples["t"][own], return_index=True)
-        np.testing.assert_allclose(t_s, at[0])
-        np.testing.assert_allclose(values, found.samples[f"th_{model}"][own][at[1]])
+        t_s, values = lines[color, dash]
+        np.testing.assert_allclose(t_s, found.free["t"])
+        np.testing.assert_allclose(values, found.free[f"th_{model}"])
 
 
 def test_a_recording_is_drawn_with_its_truth_and_its_command(drawn, log):
@@ -147,20 +139,9 @@ def test_a_recording_is_drawn_with_its_truth_and_its_command(drawn, log):
 
 
 def test_text_is_never_parsed_as_mathematics(drawn, picture):
-    assert synthetic_run.EVIL in texts(drawn["intervals"])
     for name, figure in drawn.items():
         assert not [t for t in figure.findobj(Text) if t.get_parse_math()], name
     assert "late wake-up" in ["".join(t.itertext()) for t in ET.fromstring(picture).iter(f"{SVG}text")]
-
-
-def test_a_parameter_without_truth_nominal_or_bounds_can_be_drawn(found):
-    bare = [
-        replace(e, truth=None, nominal=None, lower=None, upper=None, low95=None, high95=None, standard_error=None)
-        for e in found.parameters
-    ]
-    labels = texts(figure_of(identification.intervals_svg, bare))
-    assert "truth" not in labels
-    assert bare[0].name in labels
 
 
 def test_a_sample_is_shown_when_it_was_taken_and_a_command_when_it_was_sent(log):

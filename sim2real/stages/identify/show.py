@@ -17,18 +17,14 @@ _MOST_ROWS = 12
 """Rows of a table of errors on the console; 120 logs have 480."""
 
 
-def show(identification: Identification, following: str = "") -> None:
-    """Print the verdict: may I use it, why, how far off will it be, what do I do next. Then print the details.
-
-    Args:
-        following: What to do where the verdict has no next command.
-    """
+def show(identification: Identification) -> None:
+    """Print the verdict: may I use it, why, how far off will it be, what do I do next. Then print the details."""
     verdict = identification.verdict
     note(f"verdict: {_USE.get(verdict.status, verdict.status)}")
     for reason in verdict.reasons[:1]:
         note(f"reason: {reason}")
-    note(f"expected error: {expected_error(identification)}")
-    note(f"next: {verdict.next or following or 'look at the reason; no flag changes it'}")
+    note(f"expected error: {identification.outlook()}")
+    note(f"next: {verdict.next}")
     print(artifact_table(identification.rows()))
     if identification.aggregate:
         print(artifact_table(identification.recordings_table().without("s.e.")))
@@ -46,16 +42,6 @@ def show(identification: Identification, following: str = "") -> None:
         note(f"  the worst second: {identification.worst.text(identification.logs)}")
 
 
-def expected_error(identification: Identification) -> str:
-    """Return the expected errors of the joint with the largest one beside its noise, as text."""
-    expected = identification.expected_error
-    if not expected:
-        return "unknown, as there are too few held-out parts, or a prediction of one diverged"
-    own, joints = [e for e in expected if e.column == expected[0].column], {e.column for e in expected}
-    which = f", the worst of {len(joints)} joints" if len(joints) > 1 else ""
-    return f"{own[0].name} " + ", ".join(f"{with_small_unit(e.error, e.unit)} {e.how}" for e in own) + which
-
-
 def summary(identification: Identification) -> dict[str, str]:
     """Return the lines that the console shows at the end: name -> text."""
     logs, search = identification.logs, identification.search
@@ -65,7 +51,7 @@ def summary(identification: Identification) -> dict[str, str]:
     for worst in identification.held_out[:1]:
         size = "diverges" if worst.error is None else with_small_unit(worst.error, worst.unit)
         lines["error on held-out data"] = f"{worst.name} {size} {worst.seconds:.3g} s ahead"
-    lines["expected error"] = expected_error(identification)
+    lines["expected error"] = identification.outlook()
     lines["verdict"] = identification.verdict.status
     lines["search"] = f"{search.evaluations} candidates in {number(search.seconds):.0f} s"
     return lines

@@ -102,12 +102,12 @@ def run(robot: RecordedRobot, config: IdentifyConfig, root: Path, run_dir: Path 
         identification = _identify(inputs, best)
         # Complete the verdict's flags to a command, and name the logs by their paths in the run folder.
         flags = identification.verdict.next
-        again = command(robot, config, root, flags) if flags else ""
+        again = command(robot, config, root, flags) if flags else _following(robot, stage, identification)
         if identification.verdict.status == "not finished":
             again = continuing(robot, config, root, stage.folder / PARAMETERS)
         verdict = replace(identification.verdict, next=again)
         identification = replace(identification, logs=inputs.sources(stage.run_dir), verdict=verdict)
-        show(identification, _following(robot, stage, identification))
+        show(identification)
         _write(identification, stage, identified_robot(identification, robot)[0])
         stage.summary(summary(identification))
     return stage.result
@@ -122,14 +122,12 @@ def _write(identification: Identification, stage: OpenStage, robot: RecordedRobo
 
 
 def _following(robot: RecordedRobot, stage: OpenStage, identification: Identification) -> str:
-    """Return what to do where the verdict has no next command."""
-    name, folder = robot.name, shlex.quote(shown(stage.folder))
-    if robot.folder is None:
-        return ""
-    if identification.verdict.status == "record again":
+    """Return what to do where no flags of identify follow from the verdict."""
+    name, folder, status = robot.name, shlex.quote(shown(stage.folder)), identification.verdict.status
+    if status == "record again" and robot.folder is not None:
         return f"sim2real check {name}, which says what motion determines the parameters"
-    if identification.verdict.status != "accepted":
-        return ""
+    if status != "accepted" or robot.folder is None:
+        return "look at the reason; no flag changes it" if status != "accepted" else ""
     if isinstance(robot, Robot):
         return f"sim2real train {name} --run {shlex.quote(shown(stage.run_dir))}"
     return f"sim2real validate {folder} --log LATER_LOG, or sim2real export {folder}"

@@ -133,7 +133,7 @@ def check_identification(
     verdict = identification.verdict
     if verdict.status != "accepted" and not config.force:
         reasons = "".join(f"\n  {reason}" for reason in verdict.reasons)
-        step = f"{verdict.next}, or " if verdict.next else ""
+        step = f"{verdict.next}; or " if verdict.next else ""
         raise Sim2RealError(
             f"the identification is not accepted: {verdict.status}{reasons}",
             hint=f"{step}train on it all the same: --force",
