@@ -35,8 +35,6 @@ _COLUMNS = ("t", "into", "segment", "recording", "held_out")
 _NO_LIMIT = 1e6
 """Value of an absent limit: ``worlds.drive_terms.NO_LIMIT``, whose module takes a second to import."""
 _AGAIN = "run `sim2real identify` again"
-UNFINISHED = {"not finished": "did not finish"}
-"""Verdict on an identification without intervals -> the reason as text."""
 
 
 @dataclass(frozen=True)
@@ -157,12 +155,6 @@ class TriedTerm:
     def gain(self) -> float | None:
         """By which share the term lowers the error."""
         return None if self.error is None or not self.without > 0.0 else 1.0 - self.error / self.without
-
-    def __str__(self) -> str:
-        """Return a few words, for a sentence."""
-        if self.error is None or self.gain is None or self.outcome == "not reached":
-            return f"{self.term} {self.outcome}"
-        return f"{self.term} {self.without:.3g} to {self.error:.3g}"
 
 
 def tried_table(rows: Sequence[TriedTerm]) -> ArtifactTable:
@@ -527,6 +519,22 @@ class Identification(Shown):
     def errors_table(self) -> ArtifactTable:
         """Return a row for each error on held-out data that is judged."""
         return compared_table(self.judged, "held out")
+
+    def needed_posterior(self, hint: str = "") -> Posterior:
+        """Return the posterior.
+
+        Args:
+            hint: Of the error, where the verdict has no next command.
+
+        Raises:
+            Sim2RealError: The fit did not finish, so there is none.
+        """
+        if self.posterior is None:
+            ended = "did not finish" if self.verdict.status == "not finished" else "has no intervals"
+            raise Sim2RealError(
+                f"this identification {ended}: its estimates may be far off", hint=self.verdict.next or hint or None
+            )
+        return self.posterior
 
     @property
     def values(self) -> dict[str, float]:

@@ -63,7 +63,7 @@ def run(config: ExportConfig) -> Path:
     identification = Identification.load(file)
     out = config.out or Path(f"{identification.pipeline}_{FILES[config.to]}")
     robot = load_robot(identification.pipeline)
-    write_export(identification, robot, config.to, out, str(file), file.resolve().parent.parent)
+    write_export(identification, robot, config.to, out, file.resolve().parent.parent)
     wrote(out)
     return out
 

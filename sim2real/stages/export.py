@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from sim2real.artifacts.files import write_json
-from sim2real.artifacts.identification import UNFINISHED, Identification
+from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.run import sha256
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
@@ -58,25 +58,19 @@ def export(
     if document.pipeline != robot.name:
         raise UsageError(f"these are parameters of pipeline {document.pipeline!r}, not of {robot.name!r}")
     in_memory = isinstance(identification, Identification)
-    where, run_dir = ("memory", None) if in_memory else (str(identification), Path(identification).resolve().parent)
-    write_export(document, robot, to, out, where, run_dir)
+    write_export(document, robot, to, out, None if in_memory else Path(identification).resolve().parent)
     return out
 
 
 def write_export(
-    identification: Identification, robot: RecordedRobot, to: str, out: Path, where: str, run_dir: Path | None
+    identification: Identification, robot: RecordedRobot, to: str, out: Path, run_dir: Path | None
 ) -> None:
     """Write one file, or the folder of a card.
 
     Args:
         run_dir: Folder of the run, in which a card looks for the log.
     """
-    if identification.posterior is None:
-        ended = UNFINISHED.get(identification.verdict.status, "has no intervals")
-        raise UsageError(
-            f"the identification in {where} {ended}: its estimates may be far off",
-            hint=identification.verdict.next or f"sim2real identify {identification.pipeline}",
-        )
+    identification.needed_posterior(f"sim2real identify {identification.pipeline}")
     # Describe the source at the head of the file.
     robot, fitting = identified_robot(identification, robot)
     model, status = robot.identifiable(fitting.max_delay_s), identification.verdict.status

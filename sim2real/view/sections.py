@@ -40,7 +40,7 @@ from sim2real.view.blocks import (
 from sim2real.view.delay_parts import delay_blocks
 from sim2real.view.identification import identify_section
 from sim2real.view.panels import Line, Panel, compared, over_time, with_unit
-from sim2real.view.signals import ComparedSeries, Signals, is_dry, pairs_of, signals_of, simulated_beside
+from sim2real.view.signals import ComparedSeries, Signals, pairs_of, signals_of, simulated_beside
 from sim2real.view.style import BLUE, INK, new_figure, styled, to_svg
 from sim2real.view.timing import timing_blocks, timing_tiles
 
@@ -116,21 +116,11 @@ def recording_svg(log: Signals, name: str) -> str:
 
 
 def servo_blocks(episodes: Sequence[Episode]) -> list[Block]:
-    """Return sentences and table on the servos of one session; empty for a log without servos."""
-    ends: list[Mapping[str, Json]] = [e.metadata.get("log", {}).get("session_end") or {} for e in episodes]
+    """Return sentences on the answers of one session's servos; empty for a log without servos."""
     # The count of answers covers all episodes of a session.
-    items = list(_answers(ends[-1], episodes[-1].metadata.get("port") == "embedded"))
-    blocks: list[Block] = [ListBlock("Servos and their measurements", items)] if items else []
-    rows = []
-    for i, end in enumerate(ends):
-        which = f"episode {i}: " if len(ends) > 1 else ""
-        for sent in end.get("sent", []):
-            values = [number(float(sent[k])) for k in ("low", "mean", "high")]
-            rows.append([f"{which}{sent['name']}", str(sent["unit"]), number(int(sent["commands"])), *values])
-    if rows:
-        caption = "Commands to the motors" + (", which were not sent" if any(map(is_dry, episodes)) else "")
-        blocks.append(TableBlock(caption, ("actuator", "unit", "commands", "min", "mean", "max"), rows, (1,)))
-    return blocks
+    end: Mapping[str, Json] = episodes[-1].metadata.get("log", {}).get("session_end") or {}
+    items = list(_answers(end, episodes[-1].metadata.get("port") == "embedded"))
+    return [ListBlock("Servos and their measurements", items)] if items else []
 
 
 def _answers(end: Mapping[str, Json], embedded: bool) -> Iterator[str]:

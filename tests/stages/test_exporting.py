@@ -113,7 +113,7 @@ def test_a_world_that_is_not_mujocos_is_refused_but_for_json(here, capsys):
 def test_an_identification_without_intervals_is_refused(arm, here, capsys, status, said):
     verdict = Judgement(status, ("why",), "sim2real identify arm --begin parameters.json")
     file = save(replace(arm, posterior=None, verdict=verdict), here / "found")
-    assert cli.main(["export", str(file)]) == errors.USAGE
+    assert cli.main(["export", str(file)]) == errors.ERROR
     told = capsys.readouterr().err
     assert said in told
     assert "hint: sim2real identify arm --begin parameters.json" in told

@@ -14,14 +14,6 @@ def test_a_log_that_tells_nothing_of_servos_has_no_block():
     assert servo_blocks([episode({"transactions": 0, "late_replies": 0, "late_s": [None] * 3})]) == []
 
 
-def test_what_was_sent_is_a_table_and_of_a_dry_run_what_would_have_been():
-    row = {"name": "tilt", "unit": "rad", "commands": 50, "low": -0.5, "mean": 0.1, "high": 1.0}
-    assert servo_blocks([episode({"sent": [row]})])[0].caption == "Commands to the motors"
-    (table,) = servo_blocks([episode({"sent": [row]}, dry=True)] * 2)
-    assert table.caption == "Commands to the motors, which were not sent"
-    assert table.rows[1] == ["episode 1: tilt", "rad", "50", "\N{MINUS SIGN}0.5000", "0.1000", "1.000"]
-
-
 def test_late_answers_of_an_emulated_robot_are_not_those_of_an_adapter():
     late = {"transactions": 100, "late_replies": 30, "late_s": [0.0, 0.01, 0.02]}
     advised = {port: str(servo_blocks([episode(late, port=port)])[0]) for port in ("/dev/ttyUSB0", "embedded")}

@@ -6,7 +6,7 @@ from collections.abc import Container, Mapping, Sequence
 import numpy as np
 
 from sim2real.artifacts.deployment import AS_HERE, Drift, Replay
-from sim2real.artifacts.identification import HELD_OUT, UNFINISHED, Identification, Noise
+from sim2real.artifacts.identification import HELD_OUT, Identification, Noise
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode
 from sim2real.identification import drift as drift_test
@@ -44,13 +44,9 @@ def tested(
     """
     robot, config = identified_robot(identification, robot)
     problem, ahead_s = _problem(robot, identification, episodes, config)
-    if identification.posterior is None:
-        ended = UNFINISHED.get(identification.verdict.status, "has no intervals")
-        raise Sim2RealError(
-            f"this identification {ended}: its estimates may be far off", hint=identification.verdict.next or None
-        )
+    posterior = identification.needed_posterior()
     # Test each parameter, and fit all of them to this log.
-    drifted, x = drift_test.drift(problem, identification.posterior, identification.widening or 1.0, robot.causes)
+    drifted, x = drift_test.drift(problem, posterior, identification.widening or 1.0, robot.causes)
     z = refine(problem, problem.table.within(x)[None], settle=False).x
     refitted = {n: float(np.ravel(v)[0]) for n, v in problem.table.decode(z).items()}
     nominal = {p.name: p.nominal for p in problem.model.parameters}

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, TypeAlias, TypeVar, cast
 
 from sim2real.artifacts.bundle import Bundle
-from sim2real.artifacts.identification import UNFINISHED, Identification
+from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import Sim2RealError, UsageError
@@ -209,11 +209,7 @@ def check_parameters(identification: Identification, robot: RecordedRobot) -> No
         raise Sim2RealError(
             f"these are parameters of pipeline {identification.pipeline!r}, not of {robot.name!r}", hint=hint
         )
-    if identification.posterior is None:
-        ended = UNFINISHED.get(identification.verdict.status, "has no intervals")
-        raise Sim2RealError(
-            f"this identification {ended}: its estimates may be far off", hint=identification.verdict.next or hint
-        )
+    identification.needed_posterior(hint)
     robot = in_world(robot, identification.world)
     expected = robot.identifiable(defaults_of(robot).identify.max_delay_s).parameters.names
     there = {p.name for p in identification.parameters if p.standard_error is not None}
