@@ -141,9 +141,16 @@ class Timing(Shown):
         return {"nodes": ", ".join(f"{name} {node.steps} steps" for name, node in self.nodes.items())}
 
     def rows(self) -> ArtifactTable:
-        """Return a row for each node."""
-        rows = [[n, t.steps, t.computation.p50, t.computation.p99, t.overruns] for n, t in self.nodes.items()]
-        return ArtifactTable(("node", "steps", "computation p50 [s]", "p99 [s]", "overruns"), rows)
+        """Return a row for each node, with times in ms."""
+        in_ms = lambda seconds: None if seconds is None else 1e3 * seconds  # noqa: E731
+        rows = []
+        for name, t in self.nodes.items():
+            oldest = max((age.max for age in t.age.values() if age.max is not None), default=None)
+            took = (t.computation.p50, t.computation.p99, t.computation.max)
+            times = (t.period.p50, t.lateness.p99, t.lateness.max, *took, t.bus.p50, t.bus.max, oldest)
+            rows.append([name, t.steps, *map(in_ms, times), t.overruns])
+        heads = ("period", "late p99", "late max", "computation", "comp. p99", "comp. max", "bus p50", "bus max")
+        return ArtifactTable(("node", "steps", *heads, "oldest input", "overruns"), rows)
 
     def save(self, folder: Path | str, name: str = "timing") -> dict[str, str]:
         """Write it into a folder.

@@ -106,15 +106,6 @@ def input_ages(episode: Episode, node: str) -> dict[str, np.ndarray]:
     return ages
 
 
-def oldest_input(episode: Episode, node: str) -> np.ndarray:
-    """Return the largest age among each step's inputs, ``(M,)`` [s], for steps that had a message on every input."""
-    ages = list(input_ages(episode, node).values())
-    if not ages:
-        return np.zeros(0)
-    oldest = np.max(ages, axis=0)
-    return oldest[np.isfinite(oldest)]
-
-
 def is_imported(episode: Episode) -> bool:
     """Return whether an episode comes from another recorder's file, so that no lateness or computation was measured."""
     return "stamps" in episode.metadata

@@ -1,7 +1,7 @@
 """Timing of a log on a page: the schedule as a figure, and a row of numbers for each node."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,54 +10,31 @@ from matplotlib.patches import Patch
 
 from sim2real.artifacts.timing import Timing
 from sim2real.graph.episode import Episode, Steps
-from sim2real.log.session import is_imported, oldest_input
+from sim2real.log.session import is_imported
 from sim2real.types import Json
 from sim2real.view import style
-from sim2real.view.blocks import MISSING, Block, FigureBlock, TableBlock, Tile, fixed, number
+from sim2real.view.blocks import Block, FigureBlock, TableBlock, Tile
 from sim2real.view.node_looks import color_of, in_order, slowest_period_s
 from sim2real.view.style import BLUE, MUTED, ORANGE, new_figure, styled, to_svg
 
 _PERIODS_SHOWN = 4.5
 
 
-@dataclass(frozen=True)
-class Times:
-    """Times of one node's N steps [ms].
-
-    Attributes:
-        period: Shape ``(N - 1,)``: from one wake-up to the next.
-        lateness: Shape ``(N,)``: from the start by the timing rules to the wake-up.
-        computation: Shape ``(N,)``: from the wake-up to the end.
-    """
-
-    period: np.ndarray
-    lateness: np.ndarray
-    computation: np.ndarray
-
-
-def times(steps: Steps) -> Times:
-    """Return the times of a node's steps."""
-    return Times(np.diff(steps.woken) / 1e3, (steps.woken - steps.start) / 1e3, (steps.end - steps.woken) / 1e3)
-
-
 def timing_tiles(episodes: Sequence[Episode]) -> Iterator[Tile]:
     """Yield the worst lateness, the oldest input and the overruns of some episodes; nothing of an imported log."""
     if any(map(is_imported, episodes)):
         return
-    late = {n: np.concatenate([times(e.steps[n]).lateness for e in episodes]) for n in episodes[0].steps}
-    p99 = {n: float(np.quantile(values, 0.99)) for n, values in late.items() if len(values)}
-    worst = max(p99, key=lambda n: p99[n])
-    yield Tile("lateness, p99", f"{p99[worst]:.2f} ms", f"of {worst}, the worst node")
+    nodes = [(name, node) for e in episodes for name, node in Timing.of(e).nodes.items()]
+    late = [(node.lateness.p99, name) for name, node in nodes if node.lateness.p99 is not None]
+    worst_s, name = max(late)
+    yield Tile("lateness, p99", f"{1e3 * worst_s:.2f} ms", f"of {name}, the worst node")
     # Lateness does not show old messages, so show the oldest input, too.
-    old = {n: np.concatenate([oldest_input(e, n) for e in episodes]) for n in episodes[0].steps}
-    oldest = {n: 1e3 * float(ages.max()) for n, ages in old.items() if ages.size}
-    if oldest:
-        reader = max(oldest, key=lambda n: oldest[n])
-        yield Tile("oldest input of a step", f"{oldest[reader]:.1f} ms", f"of {reader}")
-    ends: list[Mapping[str, Json]] = [e.metadata.get("log", {}).get("session_end") or {} for e in episodes]
-    overruns = [t.get("overruns", 0) for end in ends for t in end.get("timing", {}).values()]
-    if overruns:
-        lost = ends[-1].get("lost_replies")  # the count covers all episodes of a session
+    if old := [(age.max, name) for name, node in nodes for age in node.age.values() if age.max is not None]:
+        oldest_s, name = max(old)
+        yield Tile("oldest input of a step", f"{1e3 * oldest_s:.1f} ms", f"of {name}")
+    if overruns := [node.overruns for _, node in nodes if node.overruns is not None]:
+        end: Mapping[str, Json] = episodes[-1].metadata.get("log", {}).get("session_end") or {}
+        lost = end.get("lost_replies")  # the count covers all episodes of a session
         yield Tile("overruns", str(sum(overruns)), f"{lost} lost replies" if lost is not None else "")
 
 
@@ -65,25 +42,9 @@ def timing_blocks(episode: Episode, name: str, which: str = "", folded: bool = F
     """Return schedule and table of an episode's timing; nothing of an imported log, whose steps have stamps alone."""
     if is_imported(episode):
         return []
-    end: Mapping[str, Json] = episode.metadata.get("log", {}).get("session_end") or {}
-    rows, measured = [], Timing.of(episode)
-    # Make a row for each node: quantiles of period, lateness, computation, bus and age of the oldest input.
-    for node in in_order(episode):
-        steps = episode.steps[node]
-        if len(steps) < 2:
-            continue
-        row = [node, str(len(steps))]
-        taken = times(steps)
-        for values in (taken.period, taken.lateness, taken.computation):
-            row += [fixed(float(v), 2) for v in (*np.quantile(values, [0.5, 0.99]), values.max())]
-        row += [MISSING if t is None else fixed(1e3 * t, 2) for t in astuple(measured.nodes[node].bus)]
-        ages = 1e3 * oldest_input(episode, node)
-        row += [fixed(float(q), 2) for q in np.quantile(ages, [0.5, 0.99, 1.0])] if ages.size else [MISSING] * 3
-        rows.append([*row, number(end.get("timing", {}).get(node, {}).get("overruns"))])
-    heads = [f"{q} {k}" for q in ("period", "late", "comp.", "bus", "age") for k in ("p50", "p99", "max")]
     caption = f"Timing of each node [ms]{which and ',' + which.lower().rstrip('.')}"
-    table = TableBlock(caption, ("node", "steps", *heads, "overruns"), rows, folded=folded)
-    if folded or not rows:
+    table = replace(TableBlock.of(caption, Timing.of(episode).rows()), folded=folded)
+    if folded:
         return [table]
     caption = (
         f"Computation of each node over time.{which} An arrow is a message, from the end of the sender's step to the "

@@ -9,7 +9,7 @@ import pytest
 
 from sim2real.graph.episode import Episode, MemoryRecorder, MessageRecord, StepRecord
 from sim2real.log.reader import read_log
-from sim2real.log.session import input_ages, oldest_input
+from sim2real.log.session import input_ages
 
 STEPS = {"sensor": [0, 10, 20, 30], "agent": [2, 12, 22, 32, 42]}
 READ = [(0, 0), (1, 2), (2, 2), (3, -1)]
@@ -33,9 +33,7 @@ def test_a_step_is_as_old_as_the_newest_message_that_it_used(episode):
     ages = input_ages(episode, "agent")
     np.testing.assert_allclose(1e6 * ages["sensor"], [1, 11, 1, 11, 21])
     np.testing.assert_allclose(1e6 * ages["other"], [np.nan, 11, 21, 11, 21])
-    np.testing.assert_allclose(1e6 * oldest_input(episode, "agent"), [11, 21, 11, 21])
     assert input_ages(episode, "sensor") == {}
-    assert oldest_input(episode, "sensor").size == 0
 
 
 def test_a_part_of_a_log_begins_with_what_it_holds(episode):
