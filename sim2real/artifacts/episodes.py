@@ -1,4 +1,4 @@
-"""Distributions of the training's episodes, and the recorded values beside them."""
+"""Distributions of the training's episodes."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from sim2real.artifacts.files import check, malformed, read_grouped, read_versio
 from sim2real.artifacts.identification import Noise
 from sim2real.artifacts.summary import ArtifactTable, Interval
 
-FORMAT = 1
+FORMAT = 2
 EPISODES, DRAWS = "episodes.json", "episodes.npz"
-_ARRAYS = ("draws", "recorded_s", "drawn_s", "off")
+_ARRAYS = ("draws", "drawn_s")
 _AGAIN = "run `sim2real train` again"
 
 
@@ -50,9 +50,7 @@ class Episodes:
         curriculum: Share of all differences between episodes at the first and at the last update.
         follow: Success of the training's episodes above which this share grows; 0: it grows with the updates.
         draws: Parameter -> drawn values ``(K,)``.
-        recorded_s: Node -> durations of its steps on the robot ``(N,)`` [s].
         drawn_s: Node -> durations of its steps in the timelines ``(M,)`` [s].
-        off: Column of ``noise`` -> differences between measurements and the identified model ``(N,)``, in its unit.
     """
 
     parameters: tuple[Varied, ...]
@@ -66,9 +64,7 @@ class Episodes:
     curriculum: tuple[float, float] = (1.0, 1.0)
     follow: float = 0.0
     draws: Mapping[str, np.ndarray] = field(default_factory=dict)
-    recorded_s: Mapping[str, np.ndarray] = field(default_factory=dict)
     drawn_s: Mapping[str, np.ndarray] = field(default_factory=dict)
-    off: Mapping[str, np.ndarray] = field(default_factory=dict)
     format: int = FORMAT
 
     def rows(self) -> ArtifactTable:

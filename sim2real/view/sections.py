@@ -16,7 +16,7 @@ from sim2real.artifacts.iterations import iterations, iterations_table
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run import StageFolder, finished
 from sim2real.artifacts.sensitivity import SENSITIVITY, Sensitivity
-from sim2real.artifacts.summary import ArtifactTable, words_and_unit
+from sim2real.artifacts.summary import words_and_unit
 from sim2real.graph.episode import Episode
 from sim2real.log.schema import unit_of
 from sim2real.types import Json
@@ -233,15 +233,8 @@ def _episode_blocks(artifact: StageFolder) -> list[Block]:
             f" The share of all differences grows from {first:g} to {last:g} in training{follow}; the tables show "
             f"{last:g}."
         )
-    times = [
-        [node, kind, *np.nanquantile(1e3 * values[node], (0.5, 0.99, 1.0)).tolist()]
-        for node in drawn.recorded_s
-        for kind, values in (("recorded", drawn.recorded_s), ("drawn", drawn.drawn_s))
-        if node in drawn.drawn_s and np.isfinite(values[node]).any()
-    ]
     tables = {
         "Parameters of the episodes": drawn.rows(),
-        "Computation of a step [ms]": ArtifactTable(("node", "", "p50", "p99", "max"), times),
         "Noise of a reading": drawn.noise_table(),
     }
     return [

@@ -194,8 +194,7 @@ DRAWN = Episodes(
     (Varied("gain", "1", 2.0, 1.9, 2.1, open=True),),
     noise=(Noise("q[0]", "rad", 0.1, 0.0, 0.2),),
     draws={"gain": np.array([1.9, 2.0, 2.2])},
-    recorded_s={"agent": np.array([0.001, 0.002])},
-    off={"q[0]": np.array([0.1, -0.1])},
+    drawn_s={"agent": np.array([0.001, 0.002])},
 )
 
 

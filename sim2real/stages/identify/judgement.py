@@ -58,8 +58,8 @@ from sim2real.stages.terminal.interruption import patiently
 
 _NO_DELAY_S = 1e-4
 """Estimates of delays below this count as no delay [s]."""
-_HORIZONS = (0.1, 0.25, 0.5, 1.0)
-"""Shares of the horizon at which prediction errors are listed."""
+_HORIZONS = (0.1, 1.0)
+"""Shares of the horizon up to which errors are stored; a deployment is compared at the shorter one."""
 _MOST = 3
 """Most errors above the expected ones that are named."""
 _FAR = 3.0

@@ -234,18 +234,12 @@ def _episodes(
         ends = (trip.low95, trip.high95) if trip is not None else (None, None)
         rows.append(Varied(ROUND_TRIP, "s", sum(values[n] for n in delays), *ends))
 
-    # Computation times of each node, drawn and recorded; measurements less the predictions of the identified model.
+    # Computation times of each node, which are those of the robot if they were recorded.
     drawn_s = {
         n: ((v.end - v.start)[np.arange(v.start.shape[1]) < v.count[:, None]] / TICKS_PER_S)
         for n, v in drawn.timeline.vertices.items()
+        if identification is not None and timing is not None and n in timing.steps_s
     }
-    recorded_s = {} if identification is None or timing is None else timing.steps_s
-    samples = {} if identification is None else identification.samples
-    off = {}
-    for column in (n.column for n in noise):
-        if {f"{column}_measured", f"{column}_identified"} <= set(samples):
-            gap = np.asarray(samples[f"{column}_measured"] - samples[f"{column}_identified"], np.float64)
-            off[column] = gap[np.isfinite(gap)][:_MAX_TIMES]
     widens = config.vary.misfit and not config.vary.uniform
     return Episodes(
         parameters=tuple(rows),
@@ -256,9 +250,7 @@ def _episodes(
         again=drawn.redrawn,
         longest_pause_s=drawn.longest_pause_s,
         draws={n: np.asarray(d, np.float64) for n, d in columns.items()},
-        recorded_s={n: np.asarray(s, np.float64)[:_MAX_TIMES] for n, s in recorded_s.items()},
-        drawn_s={n: np.asarray(s, np.float64)[:_MAX_TIMES] for n, s in drawn_s.items() if n in recorded_s},
-        off=off,
+        drawn_s={n: np.asarray(s, np.float64)[:_MAX_TIMES] for n, s in drawn_s.items()},
     )
 
 
