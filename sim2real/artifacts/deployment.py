@@ -24,7 +24,7 @@ from sim2real.artifacts.summary import ArtifactTable, Interval, Shown, words_and
 from sim2real.log.schema import unit_of
 from sim2real.types import Json
 
-FORMAT = 3
+FORMAT = 4
 RESULT, SIMULATION = "result.json", "simulation.npz"
 PROBE = "probe.mcap"
 """Log of the small steps that measure the delay before the episodes."""
@@ -54,8 +54,12 @@ class Gap:
     quantity: str
     real: float | None
     simulation: float | None
-    gap: float | None
     unit: str = ""
+
+    @property
+    def gap(self) -> float | None:
+        """The robot's value less that in simulation."""
+        return None if self.real is None or self.simulation is None else self.real - self.simulation
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ FRICTION = Changed("friction", "rad/s^2", 6.0, 12.0, 11.0, 13.0, 0.9, 1e-20)
 def verdict(status, success=0.5, reason="why", seconds=18.0, drift=False):
     """Return a deployment that was judged so."""
     alarms = Drift((FRICTION if drift else replace(FRICTION, p=0.8),), 0.05, ("friction",) if drift else (), seconds)
-    gap = (Gap("success", success, 1.0, success - 1.0),)
+    gap = (Gap("success", success, 1.0),)
     return Deployment((Scores({}),), gap, drift=alarms, advice=Advice(status, (reason,)))
 
 

@@ -67,7 +67,7 @@ def world(tmp_path, finished_run_dir):
         hidden.write(log_of(stage.folder, 0), hidden.play(later, policy, config.duration_s, 1))
         hidden.write(stage.output("probe", PROBE), hidden.play(later, hidden.probed(), 8.0, 2))
         logs = (Recording.load(log_of(stage.folder, 0)),)
-        gap = (Gap("success", 0.0, None, None),)
+        gap = (Gap("success", 0.0, None),)
         found = Deployment(
             (Scores({"success": 0.0}),), gap, recordings=logs, probe=Recording.load(stage.folder / PROBE)
         )

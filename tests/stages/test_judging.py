@@ -37,7 +37,7 @@ def deployed(identified=0.01, here=0.01, success=1.0, simulated=1.0, drift=STEAD
     """A deployment: how far models are off, how well it went, what has changed, and how long steps took."""
     rows = (Replay("hinge", "rad", 0.1, {"identified": identified, verdict.AS_HERE: here, "hold": 0.5}, 0.01),)
     logs = tuple(Recording(Path(f"runs/pendulum/T/deploy/episode_{i}.mcap"), episode(seconds, took_s)) for i in (0, 1))
-    gap = (Gap("success", success, simulated, None if success is None else success - simulated),)
+    gap = (Gap("success", success, simulated),)
     return Deployment((Scores({}),) * 2, gap, recordings=logs, replay=rows, drift=drift)
 
 

@@ -182,11 +182,8 @@ def history(seeds: int = 3) -> dict[str, Any]:
 def result(simulated: bool = True) -> dict[str, Any]:
     real = {"success": 0.98, "first_upright_s": 1.375, "command_rms_v": 0.97}
     model = {"success": 1.0, "first_upright_s": 1.340, "command_rms_v": 0.46} if simulated else None
-    rows = [
-        {"quantity": q, "real": v, "simulation": model[q] if model else None, "gap": v - model[q] if model else None}
-        for q, v in real.items()
-    ]
-    return {"format": 3, "episodes": [{"real": real, "simulation": model}] * 2, "gap": rows}
+    rows = [{"quantity": q, "real": v, "simulation": model[q] if model else None} for q, v in real.items()]
+    return {"format": 4, "episodes": [{"real": real, "simulation": model}] * 2, "gap": rows}
 
 
 def simulation() -> dict[str, np.ndarray]:

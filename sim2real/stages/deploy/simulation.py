@@ -236,7 +236,7 @@ def _finite(score: Mapping[str, float]) -> dict[str, float | None]:
 
 
 def _gap(quantity: str, real: float | None, simulated: float | None) -> Gap:
-    return Gap(quantity, real, simulated, None if real is None or simulated is None else real - simulated)
+    return Gap(quantity, real, simulated)
 
 
 def _mean(values: list[float | None]) -> float | None:

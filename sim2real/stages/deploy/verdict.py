@@ -96,12 +96,8 @@ def _tested(deployment: Deployment, robot: RecordedRobot, identification: Identi
     # The drift test estimates the present sum of the delays, unless the change is that of another parameter.
     other_changed = drift.named is not None and drift.named.name != ROUND_TRIP
     now = None if other_changed else {c.name: c.now for c in drift.changes}.get(ROUND_TRIP)
-    trained = tuple(
-        replace(t, real=now, gap=now - t.simulation)
-        if t.quantity == f"{ROUND_TRIP}_s" and now is not None and t.simulation is not None
-        else t
-        for t in deployment.trained
-    )
+    trip = f"{ROUND_TRIP}_s"
+    trained = tuple(replace(t, real=now) if t.quantity == trip else t for t in deployment.trained)
     return replace(deployment, trained=trained, replay=tuple(replay), drift=drift)
 
 
@@ -217,11 +213,11 @@ def _times_of_training(deployment: Deployment, bundle: Bundle) -> list[Gap]:
     """Return the robot's times beside those of training: the sum of the delays, and each node's computation time."""
     rows = []
     if delays := bundle.contract.delays_s:
-        rows.append(Gap(f"{ROUND_TRIP}_s", None, float(sum(delays.values())), None, "s"))
+        rows.append(Gap(f"{ROUND_TRIP}_s", None, float(sum(delays.values())), "s"))
     for node, (took_s, drawn_s) in _computation_times(deployment, bundle).items():
         for label, q in (("p50", 0.5), ("p99", 0.99)):
             real, trained = float(np.quantile(took_s, q)), float(np.quantile(drawn_s, q))
-            rows.append(Gap(f"step_of_{node}_{label}_s", real, trained, real - trained, "s"))
+            rows.append(Gap(f"step_of_{node}_{label}_s", real, trained, "s"))
     return rows
 
 
