@@ -22,9 +22,7 @@ _VARIABLES = {
     INK: "ink", MUTED: "muted", GRID: "grid", SHADE: "shade",
     BLUE: "blue", ORANGE: "orange", GREEN: "green", PURPLE: "purple",
 }  # fmt: skip
-CYCLE = (BLUE, ORANGE, GREEN, PURPLE)
 DASHES = ("-", (0, (5, 1.6)), (0, (1.2, 1.4)), (0, (6, 1.5, 1.2, 1.5)))
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 WIDTH_IN = 10.5
 PHONE_IN = 5.5
 """Width of a figure that a telephone shows without scrolling, with letters of at least 7 pixels [in]."""
