@@ -103,9 +103,10 @@ def solve_timing(log: Log, contract: Contract, sim: Log | None = None) -> tuple[
         sim: The log of a simulation, whose rate and ages count as those of the training.
     """
     steps = np.diff(log.t)
-    period = float(np.median(steps))
+    period = float(np.median(steps) if log.grain_s == 0.0 else np.mean(steps[steps < 1.6 * np.median(steps)]))
     wanted = 1.0 / contract.rate_hz if sim is None else float(np.median(np.diff(sim.t)))
-    jitter_s, lost = float(np.quantile(np.abs(steps - period), 0.9)), float(np.mean(steps > 1.6 * period))
+    jitter_s = max(0.0, float(np.quantile(np.abs(steps - period), 0.9)) - log.grain_s)
+    lost = float(np.mean(steps > 1.6 * period + log.grain_s))
     figures = {"rate_hz": 1.0 / period, "trained_rate_hz": 1.0 / wanted, "jitter_s": jitter_s, "lost": lost}
     findings = []
 

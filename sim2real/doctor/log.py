@@ -44,6 +44,7 @@ class Log:
         action: Outputs of the network ``(N, A)``.
         target: Commands to the drives ``(N, J)``, in the contract's order.
         message_age_s: Ages of the measurements that the steps answer, if the log has the messages [s].
+        grain_s: How late the times of the steps may be, as a recorder with a clock of its own has seen them [s].
     """
 
     t: np.ndarray
@@ -58,6 +59,7 @@ class Log:
     action: np.ndarray | None = None
     target: np.ndarray | None = None
     message_age_s: np.ndarray | None = None
+    grain_s: float = 0.0
 
     @property
     def rows_are_steps(self) -> bool:
@@ -123,7 +125,13 @@ def read_deployment(
                 f"{path}: {name} has {rows} rows; their times: {'; '.join(reader.questions.values())}",
                 hint=f"give it the rows of the times t, or times of its own; the file has {listed}",
             )
-    step_t, state_t = next(times[n] for n in ("action", "obs", "target") if n in times), times["q"]
+    of_steps = next(n for n in ("action", "target", "obs") if n in times)
+    step_t, state_t = times[of_steps], times["q"]
+    values = signals[of_steps].values
+    new = np.flatnonzero(np.append(True, (values[1:] != values[:-1]).any(axis=1)))
+    grain_s = 0.0
+    if len(new) > 20 and np.median(np.diff(new)) > 1.0:  # a recorder that is faster than the policy
+        step_t, grain_s = step_t[new], float(np.median(np.diff(step_t)))
     if len(step_t) < 20:
         raise UsageError(f"{path} has {len(step_t)} steps of the policy, too few")
     if min(step_t[-1], state_t[-1]) - max(step_t[0], state_t[0]) < 0.5 * min(np.ptp(step_t), np.ptp(state_t)):
@@ -140,7 +148,7 @@ def read_deployment(
         parts["dq"] = np.gradient(parts["q"], state_t, axis=0)
     if "action" in parts and parts["action"].shape[1] != len(joints):
         raise UsageError(f"{path}: action has {parts['action'].shape[1]} columns, the policy {len(joints)}")
-    return Log(step_t - start, state_t - start, message_age_s=age_s, **parts)
+    return Log(step_t - start, state_t - start, message_age_s=age_s, grain_s=grain_s, **parts)
 
 
 def _vector(name: str) -> tuple[str, str]:
