@@ -27,8 +27,6 @@ _LOWER = 0.75
 """A torque limit is a fault if it is below this share of the model's: drives that lag look limited a little earlier."""
 _UPRIGHT = 0.8
 """Cosine of the tilt up to which a free robot stands."""
-_LEAST = 0.08
-"""Share of the replay's error by which a change of the plant must lower it."""
 mujoco: Any = mujoco_c  # its C module has no stubs
 
 
@@ -45,28 +43,31 @@ class Plant(Setting):
 
 @dataclass(frozen=True)
 class _Part:
-    """A number of the plant: what the model says, when it is a fault, and how clearly the replay must speak for it."""
+    """A number of the plant: what the model says, and when another value is a fault.
+
+    It is one only if the replay without it, with all others estimated again, has an error larger by the dial's share.
+    """
 
     dial: Dial
     usual: float
     is_off: Callable[[float], bool]
-    clear: float
 
 
 _FACTORS = np.array((0.85, 0.93, 1.07, 1.17))
 _PARTS = {
     "kp": _Part(Dial("gain", "the drives are {value:.2f} times as stiff as the contract says",
-                     (0.35, 0.5, 0.65, 0.8, 1.25, 1.6, 2.2), lambda f: f * _FACTORS),
-                1.0, lambda f: not 0.72 <= f <= 1.4, 1.08),
+                     (0.35, 0.5, 0.65, 0.8, 1.25, 1.6, 2.2), lambda f: f * _FACTORS, 0.07),
+                1.0, lambda f: not 0.72 <= f <= 1.4),
     "friction": _Part(Dial("friction", "the joints have more dry friction than the model: {value:.0%} of their largest "
-                           "torque", (-0.1, 0.05, 0.1, 0.2, 0.4), lambda f: f + np.array((-0.03, -0.01, 0.01, 0.03))),
-                      0.0, lambda share: share > 0.08, 1.25),
+                           "torque", (-0.1, 0.05, 0.1, 0.2, 0.4), lambda f: f + np.array((-0.03, -0.01, 0.01, 0.03)),
+                           0.2),
+                      0.0, lambda share: share > 0.08),
     "armature": _Part(Dial("armature", "the joints have {value:+.0%} of their inertia beside the model's",
-                           (-0.4, 0.5, 1.0, 2.0, 4.0), lambda f: f + np.array((-0.3, -0.1, 0.1, 0.3))),
-                      0.0, lambda share: abs(share) > 0.45, 1.25),
+                           (-0.4, 0.5, 1.0, 2.0, 4.0), lambda f: f + np.array((-0.3, -0.1, 0.1, 0.3)), 0.2),
+                      0.0, lambda share: abs(share) > 0.45),
     "payload": _Part(Dial("payload", "the robot carries {value:+.0%} of its mass beside the model's",
-                          (-0.1, 0.1, 0.2, 0.4), lambda f: f + np.array((-0.05, -0.02, 0.02, 0.05))),
-                     0.0, lambda share: abs(share) > 0.12, 1.25),
+                          (-0.1, 0.1, 0.2, 0.4), lambda f: f + np.array((-0.05, -0.02, 0.02, 0.05)), 0.2),
+                     0.0, lambda share: abs(share) > 0.12),
 }  # fmt: skip
 _DELAY = Dial("delay", "", (0.0, 0.007, 0.014, 0.021, 0.028, 0.035, 0.045, 0.06),
               lambda s: np.maximum(0.0, s + np.array((-0.005, -0.0015, 0.0015, 0.005))))  # fmt: skip
@@ -76,7 +77,7 @@ _DAMPING = Dial("", "", (1.0,), lambda f: f * np.array((0.8, 1.25)))
 def _of_one(joint: str) -> _Part:
     """Return the gain of one joint."""
     text = f"{joint} is {{value:.2f}} times as stiff as the contract says"
-    return replace(_PARTS["kp"], dial=replace(_PARTS["kp"].dial, text=text), clear=1.25)
+    return replace(_PARTS["kp"], dial=replace(_PARTS["kp"].dial, text=text, least=0.2))
 
 
 _LIMITS = (0.05, 0.08, 0.12, 0.17, 0.24, 0.33, 0.45, 0.6)
@@ -362,28 +363,28 @@ def solve_plant(
     replay = Replay(drives, log)
     start = min(_DELAY.candidates(Plant(), "delay_s", _NUISANCE), key=lambda c: replay.error(c.setting))
     start = start.descended(replay.error)
-    chosen = [start, *explain(start.setting, replay.error, replay.candidates, 0.0, _LEAST, dear=True)]
+    chosen = [start, *explain(start.setting, replay.error, replay.candidates, 0.0, dear=True)]
     fitted = chosen[-1].setting
     trained = contract.delay_s if trained_delay_s is None else trained_delay_s
     age_s = 0.0 if log.rows_are_steps or log.age_s is None else float(np.median(log.age_s))
     nominal = Plant().having("delay_s", max(0.0, (trained or 0.0) - age_s))
     delay_s, base, best = fitted.number("delay_s", 0.0) + age_s, replay.error(nominal), replay.error(fitted)
     numbers, low = dict(fitted.numbers), replay.limited(fitted)
-    # What may be a fault: its name, sentence, numbers, value without it, and how clearly the replay must speak for it.
+    # What may be a fault: its name, sentence, numbers, value, and share of the error without it.
     suspects = [
-        (part.dial.fault, part.dial.says(name)(fitted), [name], numbers[name], part.clear)
+        (part.dial.fault, part.dial.says(name)(fitted), [name], numbers[name], part.dial.least)
         for name, part in {**_PARTS, **{f"kp {j}": _of_one(j) for j in drives.joints}}.items()
         if name in numbers and part.is_off(numbers[name])
     ]
     if low:
         text, names = f"torque is clipped: {shortened(list(low.values()))}", [f"limit {j}" for j in low]
-        suspects.append(("torque limit", text, names, min(numbers[n] for n in names), 1.2))
+        suspects.append(("torque limit", text, names, min(numbers[n] for n in names), 0.17))
     if delay_s - (0.010 if trained is None else trained) > _LATER_S:
         of_training = "none that is known" if trained is None else f"{1e3 * trained:.0f} ms"
         text = f"motion follows a target after {1e3 * delay_s:.0f} ms; the training had {of_training}"
-        suspects.append(("delay", text, ["delay_s"], delay_s, 1.08))
+        suspects.append(("delay", text, ["delay_s"], delay_s, 0.07))
     findings = []
-    for fault, text, names, value, clear in suspects:
+    for fault, text, names, value, least in suspects:
         # The others are estimated again without it.
         rest = Plant(tuple((n, v) for n, v in fitted.numbers if n not in names))
         moves = [_NUISANCE[1], *([_PARTS["kp"].dial.move("kp")] if "kp" in dict(rest.numbers) else [])]
@@ -395,7 +396,7 @@ def solve_plant(
         rest = replace(start, setting=rest, moves=moves).descended(replay.error).setting
         joints = [i for i, j in enumerate(drives.joints) if f"kp {j}" in names] or list(range(len(drives.joints)))
         without, with_it = (float(replay.errors(p)[joints].mean()) for p in (rest, fitted))
-        if without >= clear * with_it:
+        if with_it <= (1.0 - least) * without:
             share = float(np.clip(gap / max(base - best, gap, 1e-9), 0.0, 1.0))
             question = "timing" if fault == "delay" else "plant"
             findings.append(Finding(fault, question, text, share, {names[0].split()[0]: float(value)}))

@@ -54,12 +54,14 @@ class Candidate(Generic[S]):
         setting: What a deployment with it is like.
         text: Returns the sentence about a setting.
         moves: Each returns settings near one, which differ in one way.
+        least: Share of the error by which it must lower it.
     """
 
     fault: str
     setting: S
     text: Callable[[S], str]
     moves: Sequence[Callable[[S], Iterable[S]]] = ()
+    least: float = 0.12
 
     def descended(self, error: Callable[[S], float]) -> Candidate[S]:
         """Return the candidate with the best setting near its own, one way after the other."""
@@ -81,12 +83,14 @@ class Dial:
         text: A sentence with ``name``, ``value`` and ``ms``.
         grid: The values that are tried first.
         near: Returns those near a value.
+        least: As of a candidate.
     """
 
     fault: str
     text: str
     grid: Sequence[float]
     near: Callable[[float], Iterable[float]] = lambda _: ()
+    least: float = 0.12
 
     def move(self, name: str) -> Callable[[S], Iterable[S]]:
         """Return what gives settings near one."""
@@ -95,7 +99,8 @@ class Dial:
     def candidates(self, setting: S, name: str, more: Sequence[Callable[[S], Iterable[S]]] = ()) -> list[Candidate[S]]:
         """Return a candidate for each value of the grid; ``more``: further moves."""
         moves = [self.move(name), *more]
-        return [Candidate(self.fault, setting.having(name, float(v)), self.says(name), moves) for v in self.grid]
+        return [Candidate(self.fault, setting.having(name, float(v)), self.says(name), moves, self.least)
+                for v in self.grid]  # fmt: skip
 
     def says(self, name: str) -> Callable[[Setting], str]:
         """Return what gives the sentence about a setting."""
@@ -107,7 +112,6 @@ def explain(
     error: Callable[[S], float],
     candidates: Callable[[S], Iterable[Candidate[S]]],
     sound: float,
-    least: float,
     dear: bool = False,
 ) -> list[Candidate[S]]:
     """Return the candidates that explain an error, the greatest first; each setting has those before it.
@@ -116,7 +120,6 @@ def explain(
         error: Error of a setting; it keeps what it has computed.
         candidates: Returns what may be wrong beside what a setting has already.
         sound: Error below which nothing is wrong.
-        least: Share of the error by which a candidate must lower it.
         dear: Whether an error takes long: fewer candidates are followed, and two that explain only together are missed.
     """
 
@@ -131,8 +134,9 @@ def explain(
     chosen: list[Candidate[S]] = []
     while (before := error(start)) > sound and len(chosen) < _MOST:
         found = ranked(start)
-        if found and before - error(found[0].setting) >= max(least * before, 0.4 * sound):
-            chosen.append(found[0])
+        clear = [c for c in found if before - error(c.setting) >= max(c.least * before, 0.4 * sound)]
+        if clear:
+            chosen.append(clear[0])
         else:
             heads = {c.fault: c for c in reversed(found)} if not dear else {}
             firsts = sorted(heads.values(), key=lambda c: error(c.setting))[:_HEADS]

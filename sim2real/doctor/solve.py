@@ -99,7 +99,7 @@ class Link:
         """Return what is wrong, the greatest first."""
         if (before := self.error(Making())) < (sound := _FINE if self.name == "observation" else _SOUND):
             return []
-        chosen = [] if self.name == "normaliser" else explain(Making(), self.error, self.candidates, sound, 0.12)
+        chosen = [] if self.name == "normaliser" else explain(Making(), self.error, self.candidates, sound)
         error = self.error(chosen[-1].setting) if chosen else before
         if self.name not in ("network", "normaliser") or error < max(_SOUND, 0.1 * before):
             return chosen
