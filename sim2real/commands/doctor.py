@@ -81,5 +81,5 @@ def _answer(config: DoctorConfig) -> tuple[dict[str, Any], list[str], bool]:
     page = str(write_diagnosis(config.out, found, log, config.policy.stem))
     say(page)
     lines = [found.sentence, *(f"- {f.question}: {f.text}; {f.share:.0%} of this gap" for f in found.findings),
-             *(f"- {question} was not asked: {why}" for question, why in found.skipped.items())]  # fmt: skip
+             *(f"- not asked: {question}: {why}" for question, why in found.skipped.items())]  # fmt: skip
     return found.to_dict() | {"page": page}, lines, bool(found.findings) or found.unexplained

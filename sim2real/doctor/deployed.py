@@ -92,7 +92,10 @@ class Deployed:
         first = min(max(self.history + 1, len(log.t) // 10), len(log.t) // 2)
         self.rows = np.unique(np.linspace(first, len(log.t) - 1, _ROWS).astype(int))
         self.kinds = [term.kind for term in c.observation]
-        self.made = set(self.quantities(Making())) & set(self.kinds)
+        widths = {kind: values.shape[1] for kind, values in self.quantities(Making()).items()}
+        fitting = [term for term in c.observation if widths.get(term.kind) == c.size_of(term)]
+        self.made = {term.kind for term in fitting}
+        self.unread = [term.term for term in c.observation if term not in fitting]
 
     def _state(self, late_s: float) -> dict[str, np.ndarray]:
         if late_s not in self._states:
@@ -140,7 +143,7 @@ class Deployed:
         for term, lag in c.layout:
             own = c.observation[term]
             back = own.history - 1 - lag if how.number("reversed", 0.0) else lag
-            if own.kind in made:
+            if own.kind in self.made:
                 parts.append(made[own.kind][np.maximum(rows - back, 0)] * np.asarray(own.scale, float))
             elif self.log.obs is not None:
                 parts.append(self.logged_block(term, lag)[rows])

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from sim2real.doctor.contract import Contract, Policy
+from sim2real.doctor.deployed import Deployed
 from sim2real.doctor.log import Log
 from sim2real.doctor.plant import Drives, solve_plant
-from sim2real.doctor.search import Finding
+from sim2real.doctor.search import Finding, shortened
 from sim2real.doctor.solve import solve_contract
 from sim2real.errors import UsageError
 
@@ -75,7 +76,11 @@ def diagnose(policy: Policy, log: Log, drives: Drives | None = None, sim: Log | 
     contract = policy.contract
     found, errors = solve_contract(log, policy, robot_joints)
     more, times = solve_timing(log, contract, sim)
-    findings, figures, skipped = [*found, *more], {"contract": errors, "timing": times}, {}
+    findings, skipped = [*found, *more], dict[str, str]()
+    figures: dict[str, dict[str, Any]] = ({"contract": errors} if errors else {}) | {"timing": times}
+    if unread := Deployed(log, policy).unread:
+        what = f"the observation's {', '.join(unread)}" if errors else "contract"
+        skipped[what] = f"the log has no signals of the sizes of {', '.join(unread)}"
     if drives is None:
         skipped["plant"] = "it needs the model: --mjcf"
     elif log.target is None:
@@ -85,6 +90,8 @@ def diagnose(policy: Policy, log: Log, drives: Drives | None = None, sim: Log | 
             trained = None if sim is None or sim.target is None else solve_plant(drives, sim, contract)[1]["delay_s"]
             of_plant, figures["plant"] = solve_plant(drives, log, contract, trained)
             findings += of_plant
+            if drives.still:
+                skipped[f"the motion of {shortened(drives.still)}"] = "no action moves it, so the replay holds it still"
         except UsageError as error:
             skipped["plant"] = str(error.args[0])
     # One line for each fault and question.

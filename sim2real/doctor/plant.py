@@ -85,12 +85,14 @@ _NUISANCE = (_DELAY.move("delay_s"), _DAMPING.move("kd"))
 """Delay and damping of drives are estimated with anything else."""
 
 
+_TURNING = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+
+
 def driven_joints(mjcf: Path) -> list[str]:
     """Return the joints of a model that drives turn, in the order of its actuators, or of its joints without any."""
     model = read_model(mjcf)
     of_actuators = [int(model.actuator_trnid[i, 0]) for i in range(model.nu)]
-    turning = [int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)]
-    single = [i for i in range(model.njnt) if int(model.jnt_type[i]) in turning]
+    single = [i for i in range(model.njnt) if int(model.jnt_type[i]) in _TURNING]
     return [model.joint(i).name for i in of_actuators or single]
 
 
@@ -125,11 +127,11 @@ class Drives:
         if contract.drive == "torque":
             kp, kd = np.ones(len(ids)), np.zeros(len(ids))
         elif kp is None:
-            gains = [given.actuator_gainprm[own[i], 0] if i in own else 0.0 for i in ids]
+            gains = [-given.actuator_biasprm[own[i], 1] if i in own else 0.0 for i in ids]  # 0 for a motor
             biases = [-given.actuator_biasprm[own[i], 2] if i in own else 0.0 for i in ids]
             if min(gains) <= 0.0:
                 raise UsageError("neither the contract nor the model has gains of the drives",
-                                 hint="add kp and kd to the contract")  # fmt: skip
+                                 hint='add kp and kd to the contract, or drive = "torque"')  # fmt: skip
             kp, kd = np.array(gains), np.array(biases) if kd is None else kd
         self.kp, self.kd = kp, np.zeros(len(ids)) if kd is None else kd
         self.torque_driven = contract.drive == "torque"
@@ -153,6 +155,11 @@ class Drives:
         self.qpos = np.array([self.model.joint(j).qposadr[0] for j in contract.joints])
         self.dof = np.array([self.model.joint(j).dofadr[0] for j in contract.joints])
         self.inertia = self.model.dof_M0[self.dof]
+        # Other joints, such as the arms of a walking robot, have controllers of their own.
+        self.still = [n for n in names if self.model.joint(n).type[0] in _TURNING and n not in contract.joints]
+        for name in self.still:
+            dof = self.model.joint(name).dofadr[0]
+            self.model.dof_damping[dof] = 1e4 * self.model.dof_M0[dof]
         self.free = self.model.njnt > 0 and int(self.model.jnt_type[0]) == int(mujoco.mjtJoint.mjJNT_FREE)
         # The body that a payload adds to: the heaviest of a free robot, the outermost of a fixed one.
         moved = self.model.jnt_bodyid[[self.model.joint(j).id for j in contract.joints]]

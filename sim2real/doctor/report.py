@@ -53,7 +53,7 @@ def write_diagnosis(folder: Path, diagnosis: Diagnosis, log: Log, name: str) -> 
             drawn = _bars(figures["joints"], question, caption, 1.0 + 0.28 * len(figures["joints"]))
         sections.append(PageSection(question, title, lead, (), blocks, banner, drawn))
     notes = [NoteBlock(diagnosis.sentence)]
-    notes += [NoteBlock(f"{question} was not asked: {why}.") for question, why in diagnosis.skipped.items()]
+    notes += [NoteBlock(f"Not asked: {question}: {why}.") for question, why in diagnosis.skipped.items()]
     return write_page(folder / PAGE, name, sections, notes=notes)
 
 

@@ -173,7 +173,7 @@ class Link:
             text = _says(f"{joint} has the other sign in {place}")
             for whole in (False, True):
                 yield Candidate("sign", _changed(how, place, signs=tuple(signs.tolist()), whole=whole), text)
-        if any(side.offset for side in sides) or (place != "the targets" and "joint_pos" not in self.d.kinds):
+        if any(side.offset for side in sides) or (place != "the targets" and "joint_pos" not in self.d.made):
             return
         moved = lambda shift: self.residuals(_changed(how, place, offset=tuple(shift.tolist()))).ravel()  # noqa: E731
         offset = np.clip(_fitted(moved, len(joints), 0.02, 0.1), -2.0, 2.0)
@@ -232,7 +232,7 @@ class Link:
         else:
             cost, made = np.zeros((len(d.contract.joints),) * 2), d.quantities(how)
             for i, term in enumerate(d.contract.observation):
-                if term.kind in ("joint_pos", "joint_vel"):
+                if term.kind in {"joint_pos", "joint_vel"} & d.made:
                     lag = term.history - 1 if how.number("reversed", 0.0) else 0
                     cost += _distance(d.logged_block(i, lag)[rows], made[term.kind][rows])
         return linear_sum_assignment(cost)[1]
@@ -296,8 +296,7 @@ def solve_contract(
     links += ["normaliser"] if has_obs and has_action else []
     links += ["target"] if has_target and (has_action or has_obs) else []
     for name in links:
-        if name == "network" and (unknown := set(deployed.kinds) - deployed.made):
-            errors["unknown"] = float(len(unknown))
+        if name == "network" and deployed.unread:
             continue
         link = Link(deployed, name, robot_joints)
         chosen = link.solve()
