@@ -7,7 +7,7 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -85,11 +85,11 @@ class Contract(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
         mean, std, clip: Normaliser outside of the network: ``clip((observation - mean) / std)``; empty: none.
     """
 
-    rate_hz: float
-    joints: tuple[str, ...]
+    rate_hz: Annotated[float, msgspec.Meta(gt=0)]
+    joints: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
     default_joint_pos: Numbers
     action_scale: Numbers
-    observation: tuple[Term, ...]
+    observation: Annotated[tuple[Term, ...], msgspec.Meta(min_length=1)]
     kp: Numbers = ()
     kd: Numbers = ()
     drive: Literal["position", "torque"] = "position"
@@ -97,7 +97,7 @@ class Contract(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
     history_order: Literal["oldest first", "newest first"] = "oldest first"
     history_layout: Literal["term", "step"] = "term"
     mean: tuple[float, ...] = ()
-    std: tuple[float, ...] = ()
+    std: tuple[Annotated[float, msgspec.Meta(gt=0)], ...] = ()
     clip: float = 1e9
 
     def per_joint(self, name: str) -> np.ndarray:
@@ -288,13 +288,8 @@ def read_policy(
         contract = msgspec.convert(facts, Contract, strict=False)
     except msgspec.ValidationError as error:
         raise UsageError(f"{where}: {error}", hint="the guide 'Doctor' has a contract with every key") from None
-    sizes = {len(contract.mean), len(contract.std)}
-    if contract.rate_hz <= 0 or not contract.observation or not contract.joints:
-        raise UsageError(f"{where}: rate_hz must be above 0, with at least one joint and one observation term")
-    if sizes != {0} and sizes != {contract.size}:
+    if {len(contract.mean), len(contract.std)} not in ({0}, {contract.size}):
         raise UsageError(f"{where}: mean and std need {contract.size} numbers, as the observation has")
-    if min(contract.std, default=1.0) <= 0.0:
-        raise UsageError(f"{where}: std must be above 0")
     return Policy(content, contract)
 
 

@@ -91,7 +91,6 @@ class Deployed:
         self.history = max(term.history for term in c.observation)
         first = min(max(self.history + 1, len(log.t) // 10), len(log.t) // 2)
         self.rows = np.unique(np.linspace(first, len(log.t) - 1, _ROWS).astype(int))
-        self.kinds = [term.kind for term in c.observation]
         widths = {kind: values.shape[1] for kind, values in self.quantities(Making()).items()}
         fitting = [term for term in c.observation if widths.get(term.kind) == c.size_of(term)]
         self.made = {term.kind for term in fitting}
