@@ -1,5 +1,7 @@
 """CompiledGraph, in XLA: a dozen topologies against the simulated clock, and everything that one can do with it."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -312,8 +314,9 @@ def test_what_does_not_fit_is_refused():
     nodes, supervisor = topologies.robot(jax_hash_node)
     world = timeline.vertices["world"]
     empty = {**timeline.vertices, "world": Vertex(world.start, world.end, np.zeros(1, np.int64))}
+    edges = {k: replace(e, seq_in=np.full_like(e.seq_in, -1)) for k, e in timeline.edges.items()}
     with pytest.raises(UsageError, match="no tick of the world"):
-        CompiledGraph(nodes, supervisor, Timeline(empty, timeline.edges))
+        CompiledGraph(nodes, supervisor, Timeline(empty, edges))
     a = {"a": Ramp("a", 10)}
     none = Timeline({"a": Vertex(np.zeros((1, 0), np.int64), np.zeros((1, 0), np.int64), np.zeros(1, np.int64))}, {})
     with pytest.raises(UsageError, match="shorter than one row"):
