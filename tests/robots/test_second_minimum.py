@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from sim2real.identification.config import FitConfig
-from sim2real.identification.fit import fit
+from sim2real.identification.fit import _at_other_delays, refine
+from sim2real.identification.problem import Problem
 from sim2real.identification.segments import Span
 from sim2real.stages.config import RecordConfig
 from sim2real.stages.load import load_robot
@@ -16,17 +17,21 @@ TRUTH = {"actuator_delay": 0.02, "gain": 2.8, "damping": 0.252, "armature": 0.00
 COUNT_RAD = 2 * np.pi / 4096
 
 
-def test_a_fit_that_begins_near_the_second_minimum_ends_in_the_first():
+def test_a_fit_that_ends_in_the_second_minimum_goes_on_to_the_first():
     robot = load_robot("arm")
     model = robot.identifiable(0.06)
     signal = robot.drive.around(excitation(RecordConfig(duration_s=12.0, amplitude=0.8), robot.rate_hz, 3))
-    config = FitConfig(generations=0, max_delay_s=0.06)  # without a search, descents alone
+    config = FitConfig(max_delay_s=0.06)
     values = {p.name: p.nominal for p in model.parameters} | TRUTH | {"sensor_delay": 0.0}
     episode = simulate(model, robot, signal, values, config)
     readings = episode.outputs["sensor"]
     readings["position"] = np.round(readings["position"] / COUNT_RAD) * COUNT_RAD
     table = model.parameters.with_fixed({"sensor_delay": 0.0, "payload": 0.0})
-    spans = [Span(0, begin_s) for begin_s in np.arange(0.0, 10.5, 1.3)]
-    found = fit(model, [episode], spans, 1.3, config, table).values
+    spans = [Span(0, begin_s) for begin_s in (0.0, 2.6, 5.2, 7.8)]
+    problem = Problem(model, [episode], spans, 1.3, config, table)
+    begin = table.encode(values | {"actuator_delay": 0.028, "armature": 0.0045})
+    second = refine(problem, begin[None], coarse=True)
+    assert table.decode(second.x)["actuator_delay"] > TRUTH["actuator_delay"] + 4e-3
+    found = table.decode(_at_other_delays(problem, second, None).x)
     assert found["actuator_delay"] == pytest.approx(TRUTH["actuator_delay"], abs=1.5e-3)
     assert found["armature"] == pytest.approx(TRUTH["armature"], rel=0.1)
