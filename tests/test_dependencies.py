@@ -23,7 +23,7 @@ MAY_IMPORT = {
     "hardware": {"sim2real.policy.runner"},
     "interop": {"sim2real.interop.brax", "sim2real.interop.vector"},
     "parquet": {"sim2real.log.importing.lerobot"},
-    "unitree": {"sim2real.emulation.legs", "sim2real.hardware.unitree.dds", "sim2real.hardware.unitree.messages"},
+    "unitree": {"sim2real.hardware.unitree.dds", "sim2real.hardware.unitree.messages"},
     "warp": set(),  # MJX imports Warp itself
 }
 """Extra -> modules that import its packages. A scene is called by ``view.recording``, which has checked by then."""
