@@ -1,17 +1,6 @@
-"""Plays random tasks on dm_control, on C and on MJX in double precision, and says where their streams differ.
+"""Plays random tasks on dm_control, on C and on MJX in double precision, and says where their streams differ."""
 
-``python tests/composer/fuzz.py 0 200`` plays the tasks of seeds 0 to 199, two episodes of each, on dm_control and on C,
-with tendons, pairs, equalities, actuators and sensors across models, whose elements change their names afterwards. With
-``--engine mjx`` it plays them on C and on MJX, without welds and distances, from the same random numbers.
-``--contacts same`` has contacts that MJX finds as C does, ``--contacts all`` any; ``--jobs``: number of processes.
-"""
-
-import argparse
 import functools
-import multiprocessing
-import sys
-import time
-import traceback
 
 import numpy as np
 from dm_env import specs
@@ -167,43 +156,3 @@ def compare(seed, contacts=None, engine="dm_control"):
         mine = play_on_mjx(seed, contacts, True, (0, 1), linked="mjx")
         return max(differ(play(ours, seed, contacts, True, key, linked="mjx"), m) for key, m in enumerate(mine))
     return differ(*(play(kit(name), seed, contacts, episodes=2, linked=True) for name in ("dm_control", "sim2real")))
-
-
-def _compare(given):
-    import jax
-
-    start = time.process_time()
-    try:
-        with jax.enable_x64(True):
-            found = compare(*given)
-    except Exception:
-        found = np.inf, traceback.format_exc()
-    return given[0], *found, time.process_time() - start
-
-
-def main():
-    """Play the tasks of some seeds; print what differs."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("first", type=int)
-    parser.add_argument("count", type=int)
-    parser.add_argument("--engine", choices=["dm_control", "mjx"], default="dm_control")
-    parser.add_argument("--contacts", choices=["same", "all"])
-    parser.add_argument("--jobs", type=int, default=1)
-    args = parser.parse_args()
-    tolerance = 1e-6 if args.engine == "mjx" and args.contacts else 1e-9
-    tasks = [(seed, args.contacts, args.engine) for seed in range(args.first, args.first + args.count)]
-    good, played = [], 0
-    with multiprocessing.get_context("spawn").Pool(args.jobs) as pool:
-        for seed, worst, where, seconds in pool.imap_unordered(_compare, tasks):
-            agrees, played = worst < tolerance, played + 1
-            good += [worst] if agrees else []
-            print(
-                f"{seed}: {worst:.1e}, {seconds:.0f} s of processor time{'' if agrees else ' DIFFERS ' + where}",
-                flush=True,
-            )
-    print(f"{len(good)} of {played} tasks agree, to {max(good, default=0.0):.1e}")
-    return len(good) < played
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -135,6 +135,13 @@ def test_units_travel_with_the_model(caplog):
     assert model.jnt_range[:, 1].tolist() == pytest.approx([np.radians(9), 9.0])
     np.testing.assert_allclose(model.body_quat[model.jnt_bodyid[0]], [0.5**0.5, 0, 0.5**0.5, 0], atol=1e-12)
     assert "unit" in caplog.text
+    caplog.clear()
+    told = mjcf.from_xml_string(part)
+    told.compiler.angle = "radian"
+    world = composer.Arena().mjcf_model
+    world.attach(told)
+    assert world.compile().jnt_range[0, 1] == 9.0
+    assert not caplog.text
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Random tasks show the same on dm_control, on C and on MJX; more of them: see ``fuzz``."""
+"""Random tasks show the same on dm_control, on C and on MJX."""
 
 import jax
 import pytest
@@ -24,8 +24,15 @@ def test_random_tasks_are_those_of_dm_control(oracle, seeds):
 
 
 @pytest.mark.night
-def test_random_tasks_are_the_same_on_mjx():
-    """Ten tasks whose models differ in their numbers, as copies in one program: compiling more is for ``fuzz``."""
+@pytest.mark.parametrize(("seed", "contacts", "tolerance"), [(0, None, 1e-9), (1, "same", 1e-6)])
+def test_random_tasks_are_the_same_on_mjx(seed, contacts, tolerance):
+    found = compare(seed, contacts, "mjx")
+    assert found[0] < tolerance, found
+
+
+@pytest.mark.night
+def test_tasks_with_other_numbers_are_the_same_on_mjx():
+    """Ten tasks whose models differ in their numbers, as copies in one program."""
     mine = play_variants_on_mjx(ON_MJX, VARIANTS)
     found = [differ(play(kit("sim2real"), ON_MJX, None, True, i, numbers=i), mine[i]) for i in VARIANTS]
     assert max(found)[0] < 1e-9, max(found)
