@@ -57,6 +57,7 @@ class ServoFirmware:
     def put(self, register: Register, value: int) -> None:
         """Set a register, without the checks of a write from the bus."""
         self._memory[register.address : register.end] = register.encode(value)
+        self._watchdog_ns = None
 
     # What the bus asks
 
@@ -154,10 +155,11 @@ class ServoFirmware:
 
     def watchdog_deadline_ns(self) -> int | None:
         """Return the time at which its watchdog trips without an instruction; None if it has none, or it is off."""
-        watchdog = self.family.watchdog
-        if watchdog is None or self.get(watchdog) <= 0 or not self.get(self.family.torque):
-            return None
-        return self.heard_ns + round(self.get(watchdog) * watchdog.unit * 1e9)
+        if self._watchdog_ns is None:  # a register has changed; the bus asks at every event
+            watchdog, armed = self.family.watchdog, self.get(self.family.torque)
+            limit = self.get(watchdog) * watchdog.unit if watchdog is not None and armed else 0.0
+            self._watchdog_ns = max(round(1e9 * limit), 0)
+        return self.heard_ns + self._watchdog_ns if self._watchdog_ns else None
 
     def trip_watchdog(self) -> None:
         """Trip the watchdog."""
