@@ -1,6 +1,9 @@
-"""A robot as a gymnasium vector environment: spaces, seeds, ends of episodes, and refusals."""
+"""A robot as a gymnasium vector environment, and as one of Stable-Baselines3: spaces, seeds, ends, and refusals."""
 
+import importlib.util
 import math
+import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,8 +11,9 @@ import pytest
 gymnasium = pytest.importorskip("gymnasium", reason="the extra interop")
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
-from sim2real.errors import UsageError  # noqa: E402
-from sim2real.interop import robot_environment, vector_env  # noqa: E402
+from sim2real.errors import Sim2RealError, UsageError  # noqa: E402
+from sim2real.interop import baselines_env, robot_environment, vector_env  # noqa: E402
+from sim2real.interop.baselines import to_baselines  # noqa: E402
 from sim2real.stages.load import load_robot  # noqa: E402
 
 COPIES = 3
@@ -128,7 +132,7 @@ def test_wrong_actions_seeds_and_modes_are_refused_in_words(env, pendulum):
 
 
 class One(gymnasium.Env):
-    """The only copy, for gymnasium's checker, which knows no vector environments."""
+    """The first copy, for gymnasium's checker, which knows no vector environments."""
 
     def __init__(self, env):
         self.env, self.metadata, self.render_mode = env, env.metadata | {"render_fps": 50}, None
@@ -140,12 +144,75 @@ class One(gymnasium.Env):
         return observation[0], {}
 
     def step(self, action):
-        observation, reward, terminated, truncated, _ = self.env.step(action[None])
+        observation, reward, terminated, truncated, _ = self.env.step(np.stack([action] * COPIES))
         return observation[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), {}
 
 
-def test_gymnasium_s_checker_finds_nothing(pendulum, recwarn):
-    made = vector_env(pendulum, 1)
-    check_env(One(made), skip_render_check=True, skip_close_check=True)
+def test_gymnasium_s_checker_finds_nothing(env, recwarn):
+    check_env(One(env), skip_render_check=True, skip_close_check=True)
     told = [str(w.message) for w in recwarn if "gymnasium" in w.filename or "gym" in str(w.message)]
     assert not [t for t in told if "symmetric and normalized" not in t], told  # actions are in volts
+
+
+def test_without_it_the_error_says_what_to_install(pendulum, monkeypatch):
+    monkeypatch.setitem(sys.modules, "stable_baselines3.common.vec_env", None)
+    with pytest.raises(Sim2RealError, match="Stable-Baselines3 is not installed") as caught:
+        baselines_env(pendulum, 2)
+    assert "pip install stable-baselines3" in str(caught.value.hint)
+
+
+def test_copies_that_start_anew_later_are_refused(pendulum, baselines):
+    assert baselines_env(pendulum, 2, seed=1).num_envs == 2
+    with pytest.raises(UsageError, match="this environment's mode is 'NextStep'"):
+        to_baselines(vector_env(pendulum, 2))
+
+
+class VecEnv:
+    """In the place of Stable-Baselines3's, where that is not installed: it brings PyTorch."""
+
+    def __init__(self, num_envs, observation_space, action_space):
+        self.num_envs, self.observation_space, self.action_space = num_envs, observation_space, action_space
+
+    def step(self, actions):
+        self.step_async(actions)
+        return self.step_wait()
+
+
+@pytest.fixture(scope="module")
+def baselines(same_step):
+    with pytest.MonkeyPatch.context() as patch:
+        if importlib.util.find_spec("stable_baselines3") is None:
+            patch.setitem(sys.modules, "stable_baselines3.common.vec_env", SimpleNamespace(VecEnv=VecEnv))
+        yield to_baselines(same_step, seed=3)
+
+
+def test_the_time_limit_is_told_with_the_last_observation(baselines):
+    baselines.seed(3)
+    first = baselines.reset()
+    for step in range(1, 25):
+        observation, reward, done, infos = baselines.step(np.ones((COPIES, 1), np.float32))
+        assert done.tolist() == [step == 24] * COPIES
+    assert reward.dtype == np.float32
+    assert all(info["TimeLimit.truncated"] for info in infos)
+    assert {"success", "return", "terminal_observation"} <= infos[0].keys()
+    assert not observation[:, 3:].any(), "already the first observation of the next episode"
+    assert infos[0]["terminal_observation"][15] == 1.0
+    baselines.seed(3)
+    np.testing.assert_array_equal(baselines.reset(), first)
+    assert baselines.get_attr("num_envs", [0, 2]) == [COPIES] * 2
+    assert baselines.env_method("close", indices=1) == [None]
+    with pytest.raises(UsageError, match="cannot be set"):
+        baselines.set_attr("num_envs", 4)
+
+
+def test_its_ppo_trains_on_it(baselines):
+    stable_baselines3 = pytest.importorskip("stable_baselines3")
+    from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+
+    wrapped = VecNormalize(VecMonitor(baselines))
+    model = stable_baselines3.PPO("MlpPolicy", wrapped, n_steps=32, batch_size=48, n_epochs=1, device="cpu", seed=0)
+    before = [p.detach().clone() for p in model.policy.parameters()]
+    model.learn(288)
+    assert model.num_timesteps == 288
+    assert len(model.ep_info_buffer) == COPIES * (288 // COPIES // 24)
+    assert any((a != b).any() for a, b in zip(before, model.policy.parameters(), strict=True))
