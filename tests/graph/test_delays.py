@@ -157,7 +157,7 @@ def enough(dist, window):
     return 14 + window  # the generated messages are burstier than any rate: keep them all
 
 
-@settings(max_examples=50)
+@settings(max_examples=25)
 @given(messages, st.integers(0, 300), st.integers(5, 45), st.integers(1, 3), st.booleans())
 def test_zoh_against_the_letter(sent, ts_ms, delay_ms, window, skip):
     ts, delay = ts_ms / 1000, delay_ms / 1000
@@ -185,7 +185,7 @@ def test_a_message_is_received_its_delay_after_it_was_sent(interp):
     assert float(dist.apply(empty, age, 1, PERIOD, ts).ts_recv[-1]) == 0.0
 
 
-@settings(max_examples=50)
+@settings(max_examples=25)
 @given(messages, st.integers(1, 300), st.integers(5, 45), st.integers(1, 3))
 def test_linear_against_the_letter(sent, ts_ms, delay_ms, window):
     ts, delay = ts_ms / 1000 + 3e-4, delay_ms / 1000
@@ -197,7 +197,7 @@ def test_linear_against_the_letter(sent, ts_ms, delay_ms, window):
     np.testing.assert_allclose(got[-len(expected) :], expected, atol=2e-4)
 
 
-@settings(max_examples=50)
+@settings(max_examples=25)
 @given(messages, st.integers(0, 300), st.integers(5, 45))
 def test_zoh_mean_against_the_letter(sent, ts_ms, delay_ms):
     ts, delay = ts_ms / 1000, delay_ms / 1000

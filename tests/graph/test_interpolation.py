@@ -37,9 +37,8 @@ def served(values, interp, delay=DELAY, window=1, skip=False):
 
 @pytest.mark.parametrize("interp", ["linear", "zoh_mean", "zoh"])
 @pytest.mark.parametrize("dtype", [*WHOLE, "bool"])
-@pytest.mark.parametrize("kind", [np.asarray, jnp.asarray])
-def test_integers_and_booleans_hold(interp, dtype, kind):
-    values = values_of(dtype)
+def test_integers_and_booleans_hold(interp, dtype):
+    values, kind = values_of(dtype), jnp.asarray if interp == "zoh_mean" else np.asarray
     got = served({"v": kind(values), "pair": kind(np.stack([values, values[::-1]], axis=1))}, interp)
     assert got.data["v"].dtype == dtype
     assert got.data["v"][-1] == values[HELD]

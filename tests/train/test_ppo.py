@@ -16,7 +16,7 @@ from sim2real.training.ppo.trainer import train
 from sim2real.training.ppo.update import keys
 
 SMALL = PPOConfig(
-    num_envs=64, minibatches=4, rollout_steps=16, total_steps=80_000, hidden=(32,), evaluations=4, eval_steps=20,
+    num_envs=64, minibatches=4, rollout_steps=16, total_steps=40_000, hidden=(32,), evaluations=4, eval_steps=20,
     gamma=0.9, reward_scale=0.5,
 )  # fmt: skip
 TINY = dataclasses.replace(SMALL, total_steps=1, hidden=(4,), evaluations=1, epochs=1, minibatches=1)
