@@ -94,7 +94,7 @@ def with_expected_errors(
                 expects = None if limit is None or not math.isfinite(limit) else factor * limit
                 source, size = _source(names, r, fitted), error if math.isfinite(error) else None
                 rows.append(ComparedError(source, p.column, p.name, p.unit, kind, seconds, size, expects, factor))
-            if kind == AHEAD and len(rows) == 1 and p.column in whole:  # the data of one recording is all that there is
+            if kind == AHEAD and rows and len(names) == 1 and p.column in whole:  # one recording is all held-out data
                 judged[p.column] = replace(whole[p.column], expected=rows[0].expected, wider=factor)
             else:
                 compared += rows

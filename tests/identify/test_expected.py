@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sim2real.artifacts.identification import AHEAD, FREE_RUN, Identification, Judgement
+from sim2real.artifacts.identification import AHEAD, FREE_RUN, HELD_OUT, ComparedError, Identification, Judgement
 from sim2real.identification.expected import wider_for, with_expected_errors
 from sim2real.identification.held_out import HeldOutPart
 from sim2real.identification.verdict import Position
@@ -68,6 +68,19 @@ def test_it_is_not_below_the_noise_and_a_joint_at_rest_is_not_compared():
     found = judged([part("a", 1e-5, 1e-5), part("b", 1e-5, 1e-5)], error=0.0, measured=NO_MOTION)
     assert found.errors == ()
     assert found.expected_of(JOINT.column, AHEAD).error == pytest.approx(2.0 * JOINT.sigma)
+
+
+@pytest.mark.parametrize("names", [["log"], ["log", "at rest"]])
+def test_the_error_on_all_held_out_data_is_that_of_the_only_log(names):
+    rows, parts = samples(0.01), [part("a", 0.01, 0.01), part("b", 0.02, 0.01)]
+    whole = ComparedError(HELD_OUT, JOINT.column, JOINT.name, "rad", AHEAD, 2.0, 0.01, baselines={"hold": 0.5})
+    document = Identification("robot", (), Judgement("", ()), (), errors=(whole,), samples=rows, free=rows)
+    found = with_expected_errors(document, [JOINT], parts, names, 1, [{}] * len(names))
+    (overall,) = found.held_out
+    assert overall.baselines == {"hold": 0.5}
+    assert (overall.expected is not None) == (len(names) == 1)
+    assert len([e for e in found.errors if e.kind == AHEAD]) == len(names)
+    assert {e.source for e in found.judged} >= {HELD_OUT}
 
 
 def motion(low, high, speed):
