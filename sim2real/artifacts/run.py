@@ -62,11 +62,6 @@ class Source:
     path: str
     sha256: str
 
-    @staticmethod
-    def of(path: Path, run_dir: Path) -> Source:
-        """Return the source for a file."""
-        return Source(portable(path, run_dir), sha256(path))
-
 
 @dataclass(frozen=True)
 class Manifest:
@@ -584,30 +579,10 @@ def git_state(folder: Path | None = None) -> dict[str, Json] | None:
     Args:
         folder: Default: the working directory.
     """
-    safe = {"core.fsmonitor": "false", "core.hooksPath": os.devnull}
-
-    def git(*arguments: str) -> str:
-        settings = {f"GIT_CONFIG_KEY_{i}": key for i, key in enumerate(safe)}
-        settings |= {f"GIT_CONFIG_VALUE_{i}": value for i, value in enumerate(safe.values())}
-        done = subprocess.run(
-            ["git", "--no-optional-locks", *arguments],
-            cwd=folder,
-            env={**os.environ, **settings, "GIT_CONFIG_COUNT": str(len(safe))},
-            capture_output=True,
-            text=True,
-            timeout=10,
-            check=True,
-        )
-        return done.stdout.strip()
-
+    command = ["git", "--no-optional-locks", "describe", "--always", "--exclude=*", "--abbrev=40", "--dirty"]
     try:
-        # Switch off programs in the repository's settings that git would run (file system monitors, hooks, filters),
-        # because the repository can come from an unknown source. The user's own settings stay.
-        for line in git("config", "--list", "--name-only", "--show-scope").splitlines():
-            scope, _, key = line.partition("\t")
-            if scope in ("local", "worktree") and key.startswith("filter."):
-                safe[key] = "false" if key.endswith(".required") else ""
-        dirty = git("status", "--porcelain", "--untracked-files=no", "--ignore-submodules=all")
-        return {"sha": git("rev-parse", "--verify", "HEAD"), "dirty": bool(dirty)}
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=10, check=True)
     except (OSError, subprocess.SubprocessError):
         return None
+    sha, _, dirty = done.stdout.strip().partition("-")
+    return {"sha": sha, "dirty": bool(dirty)}

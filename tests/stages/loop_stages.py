@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sim2real.artifacts.deployment import Advice, Changed, Deployment, Drift, Gap, Scores
 from sim2real.artifacts.identification import ROUND_TRIP, Estimate, Identification, Judgement
-from sim2real.artifacts.run import STAGES, TAKES, Source, attempts, newest, open_stage
+from sim2real.artifacts.run import STAGES, TAKES, Source, attempts, newest, open_stage, portable, sha256
 from sim2real.commands.loop import run_all
 from sim2real.commands.run_flags import RunFlags
 from sim2real.errors import Sim2RealError
@@ -59,7 +59,7 @@ class Stages:
                 status = "record again" if number in self.lacking else status
                 if status == "fails":
                     raise Sim2RealError("nothing could be simulated")
-                logs = tuple(Source.of(path, opened.run_dir) for path in inputs.values())
+                logs = tuple(Source(portable(path, opened.run_dir), sha256(path)) for path in inputs.values())
                 Identification("pendulum", logs, Judgement(status, (content,)), (TRIP,)).write(
                     opened.output("parameters", "parameters.json")
                 )
