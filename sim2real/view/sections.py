@@ -262,11 +262,12 @@ def sensitivity_blocks(folder: Path) -> list[Block]:
 
 
 def deploy_section(artifact: StageFolder) -> PageSection:
-    """Return the section of a deployment: the gap between robot and simulation, and each episode."""
+    """Return the section of a deployment: the gap between robot and simulation, and each episode.
+
+    A dry run has neither simulation nor gap: the figures show its commands, which were not sent.
+    """
     deployed = Deployment.load(artifact.folder)
     logs = [signals_of(recording) for recording in deployed.recordings]
-    if deployed.dry_run:
-        return _dry_section(artifact, logs)
     blocks: list[Block] = [NoteBlock(text) for log in logs for text in log.warnings]
     # Draw each episode beside its simulation.
     units = {**logs[0].units, **deployed.units}
@@ -276,7 +277,7 @@ def deploy_section(artifact: StageFolder) -> PageSection:
         for log, columns in zip(logs, deployed.simulated, strict=True)
     ]
     for index, pairs in enumerate(episodes):
-        caption = f"Episode {index}: the robot, and the same policy in simulation. {_scores(deployed.episodes[index])}"
+        caption = f"Episode {index}: {_beside(deployed)}. {_scores(deployed.episodes[index])}"
         shown = _shown(pairs)
         if len(shown) < len(pairs):
             caption += " Speeds of the joints, and commands that do not change, are in the log."
@@ -296,32 +297,24 @@ def deploy_section(artifact: StageFolder) -> PageSection:
         note = f"in simulation {np.mean(simulated):.0%}" if simulated else ""
         tiles.append(Tile("success on the robot", f"{np.mean(real):.0%}", note))
     tiles += [Tile("episodes", str(len(deployed.episodes))), *timing_tiles([log.episode for log in logs])]
-    lead = "The policy on the robot, beside the same policy in simulation."
+    lead = f"The policy on {_beside(deployed)}."
     figure = largest_difference(episodes, [row.column for row in deployed.replay], units, "deploy-worst")
     # Tables come after all figures and sentences.
     blocks = sorted(blocks, key=lambda block: isinstance(block, TableBlock | FoldBlock))
     return PageSection("deploy", "Deploy", lead, tiles, [*blocks, *about(artifact)], _deploy_banner(deployed), figure)
 
 
-def _dry_section(artifact: StageFolder, logs: Sequence[Signals]) -> PageSection:
-    """Return the commands that a dry run computed; it has no gap."""
-    blocks: list[Block] = [NoteBlock(text) for log in logs for text in log.warnings]
-    blocks.append(NoteBlock("A dry run has no gap report, as the robot does not move."))
-    for index, log in enumerate(logs):
-        caption = f"Episode {index}: measurements, and the policy's commands, which were not sent."
-        blocks.append(FigureBlock(recording_svg(log, f"deploy-{index}"), caption))
-        blocks += timing_blocks(log.episode, f"deploy-{index}", f" Episode {index}.", folded=index > 0)
-    episodes = [log.episode for log in logs]
-    tiles = [Tile("episodes", str(len(episodes)), "dry run"), *timing_tiles(episodes)]
-    lead = "The policy on the robot, without torque."
-    return PageSection("deploy", "Deploy", lead, tiles, [*blocks, *servo_blocks(episodes), *about(artifact)], _DRY)
+def _beside(deployed: Deployment) -> str:
+    if deployed.dry_run:
+        return "the robot without torque, and the commands that were not sent"
+    return "the robot, and the same policy in simulation"
 
 
 def _deploy_banner(deployed: Deployment) -> Banner | None:
     """Return the verdict on a deployment: the first reason, the next command, further reasons; None for older files."""
     advice = deployed.advice
-    if advice is None:
-        return None
+    if deployed.dry_run or advice is None:
+        return _DRY if deployed.dry_run else None
     title = f"{advice.status[:1].upper()}{advice.status[1:]}" + (f": {advice.joint}" if advice.joint else "")
     reasons = [sentence(reason, [row.name for row in deployed.replay]) for reason in advice.reasons]
     reasons[1:1] = [f"next: {advice.next}"] if advice.next else []
@@ -406,7 +399,7 @@ def _scores(score: Scores) -> str:
 
 def _deploy_tables(deployed: Deployment) -> list[Block]:
     """Return the gap between robot and simulation, and the tests behind the verdict."""
-    blocks: list[Block] = [TableBlock.of("Robot and simulation", deployed.rows())]
+    blocks: list[Block] = [TableBlock.of("Robot and simulation", deployed.rows())] if deployed.gap else []
     if deployed.drift is not None:
         caption = (
             "Has the robot changed? Each row compares one estimate with its value in the new log, if only this has "

@@ -175,6 +175,16 @@ def test_a_deployment_without_a_simulation_is_shown(run):
     assert "1.340" not in words
 
 
+def test_a_dry_run_is_shown_without_a_simulation(only):
+    run = only("deploy")
+    document = {"format": 4, "episodes": [{"real": {}}] * 2, "gap": [], "dry_run": True}
+    (run / "deploy" / "result.json").write_text(json.dumps(document))
+    (run / "deploy" / "simulation.npz").unlink()
+    words = Page(report(run).read_text(encoding="utf-8")).words
+    assert "Dry run: the robot did not move" in words
+    assert not {"Robot and simulation", "success on the robot"} & set(words)
+
+
 def test_the_success_shown_is_that_of_the_policy_in_the_bundle(only):
     """The best evaluation of the best seed, as on the console; later evaluations may be worse."""
     history = synthetic_run.history(2)
