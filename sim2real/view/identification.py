@@ -15,6 +15,7 @@ from sim2real.artifacts.identification import (
     tried_table,
 )
 from sim2real.artifacts.run import StageFolder
+from sim2real.artifacts.summary import ArtifactTable
 from sim2real.log.schema import unit_of
 from sim2real.view import style
 from sim2real.view.blocks import (
@@ -22,7 +23,6 @@ from sim2real.view.blocks import (
     Banner,
     Block,
     FigureBlock,
-    ListBlock,
     PageSection,
     TableBlock,
     Tile,
@@ -47,6 +47,8 @@ _TITLES: dict[str, tuple[Tone, str]] = {
 _MOST_COMPARED = 12
 """Rows of errors beside the expected ones that are not folded."""
 _MAX_PANELS = 6
+_MOST_JOINTS = 6
+"""Joints whose expected errors are not folded."""
 _NUMBERS = ("estimate", "nominal", "standard_error", "low95", "high95", "lower", "upper", "truth")
 _AROUND_S = 1.0
 """Time that is drawn before and after the worst second [s]."""
@@ -240,9 +242,17 @@ def _draw_link(axes: Axes, link: Link) -> None:
 
 def _expected(result: Identification) -> list[Block]:
     """Return the expected errors, and the errors on held-out data beside them, the largest ratios first."""
-    items = [f"{e.name}, {e.how}: {number(e.error, 3)} {pretty_unit(e.unit)}".strip() for e in result.expected_error]
-    lead = ListBlock("The errors to expect on later data, for motion like the fitted one", items)
-    blocks: list[Block] = [lead] if len({e.column for e in result.expected_error}) > 1 else []
+    known = {(e.name, e.how): e for e in result.expected_error}
+    joints, kinds = (list(dict.fromkeys(key[i] for key in known)) for i in (0, 1))
+    rows = [
+        [joint, *(known[joint, how].error if (joint, how) in known else None for how in kinds), unit]
+        for joint, unit in {e.name: e.unit for e in result.expected_error}.items()
+    ]
+    lead = TableBlock.of(
+        "Expected errors, for motion like the fitted one", ArtifactTable(("joint", *kinds, "unit"), rows)
+    )
+    # The verdict has those of a single joint.
+    blocks: list[Block] = [replace(lead, folded=len(joints) > _MOST_JOINTS)] if len(joints) > 1 else []
     table = TableBlock.of("Errors on held-out data beside the expected errors and baselines", result.errors_table())
     judged = [row.exceeded or bool(row.beaten_by) for row in result.judged]
     tones: list[Tone] = ["bad" if worse else "good" for worse in judged]
