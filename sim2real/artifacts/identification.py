@@ -422,7 +422,7 @@ class Identification(Shown):
         expected_error: The error to expect of each position on later data, ahead and in a free run; the joint with the
             largest one beside its noise comes first.
         worst: The second in which the model explains a joint worst; None without samples.
-        aggregate: Quantities estimated from each recording alone; empty unless configured.
+        aggregate: Quantities estimated from each of several recordings alone; empty for one recording.
         motion: Column -> lowest and highest position, and largest speed, in the fitted segments.
         tried: What optional terms gain on held-out parts; empty if none was tried.
         terms: Optional terms of the model in the fit; None if the model has no optional terms.

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim2real.artifacts.deployment import Deployment
-from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run import StageFolder
 from sim2real.graph.episode import TICKS_PER_S, Episode, Steps
@@ -26,8 +25,8 @@ class Curve:
     Attributes:
         entity: Path of the curve in the recording.
         label: Name in the legend.
-        look: Style, which is the same in every plot: measured, identified, nominal, truth, command; empty: Rerun's.
-        t_s: Times ``(N,)`` [s]; a NaN among the values interrupts the line.
+        look: Style, which is the same in every plot: measured, identified, truth, command; empty: Rerun's.
+        t_s: Times ``(N,)`` [s].
         values: Values ``(N,)``.
     """
 
@@ -79,10 +78,6 @@ def tabs_of(artifacts: Mapping[str, StageFolder]) -> list[Tab]:
     if "record" in artifacts:
         log = signals_of(Recording.load(artifacts["record"].folder))
         tabs.append(episode_tab(_dry("Record", log), "record", log, []))
-    if "identify" in artifacts:
-        identification = Identification.load(artifacts["identify"].folder)
-        several = len(identification.recordings) > 1
-        tabs += [_identify_tab(identification, r, f" {r}" if several else "") for r in identification.recordings]
     if "deploy" in artifacts:
         deployed = Deployment.load(artifacts["deploy"].folder)
         for i, (recording, simulated) in enumerate(zip(deployed.recordings, deployed.simulated, strict=True)):
@@ -140,27 +135,6 @@ def readable(plots: Mapping[str, list[Curve]]) -> dict[str, list[Curve]]:
     return moving or dict(plots)
 
 
-def _identify_tab(identification: Identification, recording: int, which: str) -> Tab:
-    chosen = identification.disjoint() & (identification.samples["recording"] == recording)
-    entity = f"identify/{recording}" if which else "identify"
-    samples = {name: values[chosen] for name, values in identification.samples.items()}
-    t_s, segment = samples["t"], samples["segment"]
-    plots, columns = {}, {}
-    # Draw measurements and models, interrupted between segments.
-    for quantity in identification.fields:
-        curves = []
-        for model in (m for m in ("measured", "identified", "nominal") if f"{quantity}_{m}" in samples):
-            values = samples[f"{quantity}_{model}"].astype(np.float64)
-            columns.setdefault(model, {})[quantity] = values
-            series = Series(quantity, model, *interrupted(t_s, values, segment))
-            curves.append(_curve(f"{entity}/{model}", series, model, model))
-        plots[_titled(quantity, identification.units)] = curves
-    motions = [SceneMotion(f"{entity}/scene/robot", t_s, columns["measured"], ghost=False)] if columns else []
-    if "identified" in columns:
-        motions.append(SceneMotion(f"{entity}/scene/identified", t_s, columns["identified"], ghost=True))
-    return Tab(f"Identify{which}", entity, plots, motions)
-
-
 def states_of(steps: Steps) -> tuple[np.ndarray, list[str]]:
     """Return the times of a node's changes of state [s], and the new states: waiting, late, computing, idle.
 
@@ -192,9 +166,3 @@ def _motion(entity: str, states: list[Series], commands: list[Series], ghost: bo
 def _titled(name: str, units: Mapping[str, str]) -> str:
     unit = unit_of(name, units)
     return f"{name} [{unit}]" if unit else name
-
-
-def interrupted(t_s: np.ndarray, values: np.ndarray, segment: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return times and values with a NaN after the end of each segment, as the next one starts from another state."""
-    cuts = np.flatnonzero(np.diff(segment)) + 1
-    return np.insert(t_s, cuts, t_s[cuts - 1] + 1e-6), np.insert(values, cuts, np.nan)

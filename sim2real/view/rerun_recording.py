@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from sim2real.artifacts.run import finished_stages, pipeline_of
+from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import TICKS_PER_S, Episode
 from sim2real.view.node_looks import color_of, in_order, slowest_period_s
 from sim2real.view.rerun_content import IDLE, Curve, Tab, readable, states_of, tabs_of
@@ -29,10 +30,10 @@ model's prediction, drawn so that it can overlap the robot.
 
 # Readable on the viewer's dark background and on its light one; measured, identified, ... as on the page.
 _COLORS = {
-    "measured": (150, 162, 176), "identified": (66, 150, 230), "nominal": (226, 138, 48), "truth": (36, 176, 118),
+    "measured": (150, 162, 176), "identified": (66, 150, 230), "truth": (36, 176, 118),
     "command": (190, 112, 192),
 }  # fmt: skip
-_WIDTHS = {"measured": 2.0, "identified": 1.6, "nominal": 1.4, "truth": 1.2, "command": 1.6}
+_WIDTHS = {"measured": 2.0, "identified": 1.6, "truth": 1.2, "command": 1.6}
 _STATES = {"waiting": (110, 120, 132), "late": (226, 138, 48), "computing": (66, 150, 230)}
 _ROWS = 7
 """Largest number of plots below each other."""
@@ -51,10 +52,13 @@ def view(
         serve: Called with the address of the page, which is served until it returns; None: a window.
 
     Raises:
-        Sim2RealError: When Rerun is not installed, no stage is finished, or what a stage wrote is malformed.
+        Sim2RealError: When Rerun is not installed, no recording or deployment is finished, or what a stage wrote is
+            malformed.
     """
     rr = rerun_module()
     tabs = tabs_of(finished_stages(run_dir))  # before a viewer opens
+    if not tabs:
+        raise Sim2RealError(f"{run_dir} has no recording and no deployment to show", hint="its page has the rest")
     name = f"{pipeline_of(run_dir)} {Path(run_dir).resolve().name}"
     # Use one application for each run, as the viewer stores one arrangement per application.
     recording = rr.RecordingStream(f"sim2real {name}")

@@ -163,15 +163,6 @@ def free_runs() -> dict[str, np.ndarray]:
     return values
 
 
-def three_recordings() -> dict[str, np.ndarray]:
-    """The predictions of three recordings, all of the same times."""
-    one = predictions()
-    several = {name: np.concatenate([values] * 3) for name, values in one.items()}
-    several["recording"] = np.repeat(np.arange(3), len(one["t"]))
-    several["segment"] = several["segment"] + 6 * several["recording"]
-    return several
-
-
 def history(seeds: int = 3) -> dict[str, Any]:
     steps = [1000 * k for k in range(1, 11)]
     curves = [[-1300.0 / k - 10 * s for s in range(seeds)] for k in range(1, 11)]

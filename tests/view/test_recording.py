@@ -68,7 +68,6 @@ def test_every_curve_stands_on_the_one_timeline(saved, finished_run):
         assert rows[f"/{folder}/schedule/agent"] >= 3 * synthetic_run.STEPS
         assert rows[f"/{folder}/scene/robot/body_1"] == synthetic_run.STEPS
     assert rows["/deploy/0/scene/simulation/body_1"] == 400
-    assert rows["/identify/scene/identified/body_1"] == 250
 
 
 def rows_by_entity(path: Path) -> Counter[str]:
@@ -93,19 +92,12 @@ def test_a_record_alone_can_be_viewed_without_a_scene(tmp_path):
 
 def test_plots_bring_together_who_speaks_of_the_same(finished_run):
     tabs = {tab.title: tab for tab in tabs_of(finished_stages(finished_run))}
-    assert list(tabs) == ["Record", "Identify", "Deploy 0", "Deploy 1"]
+    assert list(tabs) == ["Record", "Deploy 0", "Deploy 1"]
     labels = {title: [c.label for c in curves] for title, curves in tabs["Deploy 0"].plots.items()}
     assert labels["th [rad]"] == ["measured by sensor", "true state", "simulation"]
     assert labels["action [V]"] == ["sent by actuator", "simulation"]
     command = tabs["Deploy 1"].plots["action [V]"][1]
     assert command.t_s[0] == pytest.approx(0.013), "the times that the simulation gave"
-
-
-def test_a_line_is_interrupted_where_a_segment_ends(finished_run):
-    tab = next(t for t in tabs_of(finished_stages(finished_run)) if t.title == "Identify")
-    curve = tab.plots["th [rad]"][1]
-    assert np.isnan(curve.values).sum() == 4
-    assert np.all(np.diff(curve.t_s) > 0)
 
 
 def test_states_follow_each_other_from_due_to_end():
@@ -147,6 +139,12 @@ def test_without_the_viewer_the_error_names_the_extra(run, monkeypatch):
     with pytest.raises(Sim2RealError, match="not installed") as caught:
         view(run, run / "run.rrd")
     assert "rerun-sdk" in caught.value.hint
+
+
+def test_an_identification_alone_has_nothing_to_play(only, tmp_path):
+    pytest.importorskip("rerun")
+    with pytest.raises(Sim2RealError, match="no recording and no deployment"):
+        view(only("identify"), tmp_path / "run.rrd")
 
 
 def test_a_place_that_cannot_be_written_is_named(run):
@@ -197,14 +195,3 @@ def software_vulkan(monkeypatch):
 def test_the_viewer_draws_the_curves(saved, tmp_path):
     need(LAVAPIPE.exists(), "a software Vulkan (mesa-vulkan-drivers)")
     assert drawn_roles(saved, tmp_path / "run.png") == FIRST_TAB
-
-
-def test_each_recording_of_an_identification_has_a_tab_of_its_own(only):
-    run = only("identify")
-    np.savez(run / "identify" / "predictions.npz", **synthetic_run.three_recordings())
-    tabs = tabs_of(finished_stages(run))
-    assert [tab.title for tab in tabs] == ["Identify 0", "Identify 1", "Identify 2"]
-    assert len({curve.entity for tab in tabs for plot in tab.plots.values() for curve in plot}) == 3 * 2 * 3
-    for tab in tabs:
-        t_s = tab.plots["th [rad]"][0].t_s
-        assert np.all(np.diff(t_s) >= 0)

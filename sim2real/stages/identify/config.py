@@ -41,8 +41,6 @@ class IdentifyConfig(FitConfig):
     terms: str = "own"
     """Optional terms: 'own' (the pipeline's, and one that halves the errors on held-out parts), 'auto' (chosen on
     held-out parts), 'all', 'none', or names separated by commas."""
-    each: bool = True
-    """Identify each of several logs alone, too, and report the spread between them."""
     bounds: dict[str, tuple[float, float]] = field(default_factory=dict)
     """Bounds of a parameter that replace the pipeline's: one flag a parameter."""
     fix: dict[str, float] = field(default_factory=dict)
@@ -51,8 +49,6 @@ class IdentifyConfig(FitConfig):
     """World of an installed package in which to identify; default: the robot's."""
     links: bool = False
     """Identify the distribution of the measurements' delays, their losses and the drift of their clock, too."""
-    reveal: bool = True
-    """Show the embedded robot's true parameters beside the estimates; the search does not use them."""
 
     def __post_init__(self) -> None:
         """Check the values before a log is read."""

@@ -107,15 +107,14 @@ def judge(fits: Fits, started_s: float) -> Identification:
             fits, held = patiently(lambda f=findings: determined(fits, f.check, f.spread))
             findings = patiently(lambda: Findings.of(fits.estimate, parts)) if held else findings
         fit = findings.fit
-        truth = true_values(inputs.logs[0]) if config.reveal else {}
+        truth = true_values(inputs.logs[0])
         posterior = fit.problem.table.posterior(fit.x, findings.spread.scale_covariance)
         document = _estimates(inputs.loaded.name, findings, posterior, truth, time.monotonic() - started_s)
         # Predict held-out data, beside baselines.
         bar.set_description_str("identify: predictions and baselines")
         document = patiently(lambda: _predicted(document, inputs, fit))
         bar.set_description_str("identify: each recording, distribution of delays")
-        several = config.each and inputs.fitted > 1
-        aggregate = patiently(lambda: compare_recordings(fit.problem, findings.at)) if several else ()
+        aggregate = patiently(lambda: compare_recordings(fit.problem, findings.at)) if inputs.fitted > 1 else ()
         links_ = patiently(lambda: links(fit.problem, fit.x)) if config.links else ()
         document = replace(document, terms=fits.terms, tried=fits.tried, links=links_, aggregate=aggregate)
         document = _compared(document, inputs, fit, parts)
