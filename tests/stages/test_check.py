@@ -63,6 +63,15 @@ def test_the_log_is_described(judged):
     assert command["low"] < command["high"]
 
 
+def test_commands_that_are_logged_too_seldom_decide():
+    slow = replace(GOOD, too_seldom=("10 goals a second are too few",))
+    found = Checked("arm", (GOOD, slow), (), (), ())
+    assert not found.determined
+    assert found.verdict.startswith("record again")
+    assert any("10 goals" in text for text in found.recommendation)
+    assert Checked("arm", (GOOD,), (), (), ()).determined
+
+
 @pytest.mark.parametrize(
     ("found", "named"),
     [

@@ -80,7 +80,8 @@ class Coverage:
         rate_hz: Median rate [Hz].
         gaps: Number of pauses longer than two and a half periods.
         longest_gap_s: 0 without gaps [s].
-        doubts: Sentences on a torque that may be no command, and on commands that are logged too seldom.
+        doubts: Sentences on a torque that may be no command.
+        too_seldom: Sentences on commands or measurements that are logged too seldom for the motion.
     """
 
     name: str
@@ -92,6 +93,7 @@ class Coverage:
     joints: tuple[SignalCoverage, ...] = ()
     commands: tuple[SignalCoverage, ...] = ()
     doubts: tuple[str, ...] = ()
+    too_seldom: tuple[str, ...] = ()
 
     def problems(self) -> Iterator[str]:
         """Yield a sentence for each reason why this recording determines little."""
@@ -105,7 +107,7 @@ class Coverage:
                 yield f"{joint.name} moves {joint.moving:.0%} of the time: excite it more, or for longer"
             if not _ONE_SIDED < joint.forward < 1 - _ONE_SIDED:
                 yield f"{joint.name} moves almost only one way: friction and an offset then look alike"
-        yield from self.doubts
+        yield from (*self.too_seldom, *self.doubts)
         if self.commands and all(c.high == c.low for c in self.commands):
             yield "no command changes: gains and delays of the actuator are not determined"
 
@@ -164,7 +166,12 @@ class Checked(Shown):
     @property
     def determined(self) -> bool:
         """Whether every parameter is determined; of the delays the sum suffices."""
-        return not self.undetermined
+        return not (self.undetermined or self.too_seldom)
+
+    @property
+    def too_seldom(self) -> bool:
+        """Whether a side is logged too seldom: the motion between its samples is unknown, whatever a model says."""
+        return any(r.too_seldom for r in self.recordings)
 
     @property
     def in_groups(self) -> tuple[str, ...]:
@@ -174,6 +181,8 @@ class Checked(Shown):
     @property
     def verdict(self) -> str:
         """The result in one sentence."""
+        if self.too_seldom:
+            return "record again: commands or measurements are logged too seldom for this motion"
         if self.undetermined:
             names = ", ".join(self.in_groups)
             return f"do not identify yet: some of {names} would be guesses; --fix NAME VALUE holds a known one"
@@ -293,13 +302,16 @@ def check(
     # Name the next command: where a parameter is not determined, it plans or records another motion.
     flags = {"log": config.log, "bounds": config.bounds, "fix": config.fix, "world": config.world}
     following = command(robot, replace(defaults_of(robot).identify, **flags), config.runs)
-    if isinstance(robot, Robot) and not checked.determined:
+    checked = replace(checked, pipeline=robot.name, recordings=covered)
+    if checked.too_seldom:
+        following = "log the slower side as often as the first sentence below says, or move more slowly"
+    elif isinstance(robot, Robot) and not checked.determined:
         following = f"sim2real check {robot.name} --plan --record.excitation KIND, then record what suffices"
     elif not checked.determined:
         following = f"record such a motion, or hold a known value: {following} --fix {checked.undetermined[0][0]} VALUE"
     elif planned:
         following = f"sim2real record {robot.name}"
-    return replace(checked, pipeline=robot.name, recordings=covered, following=following)
+    return replace(checked, following=following)
 
 
 def find_logs(robot: RecordedRobot, config: CheckConfig) -> dict[str, Episode]:
@@ -373,7 +385,8 @@ def coverage(name: str, episode: Episode, model: IdentifiableModel, units: Mappi
     return Coverage(
         *(name, len(begun_s), duration_s, rate_hz, gaps, longest_s, tuple(joints)),
         commands=tuple(_commands(episode, model, fields)),
-        doubts=(*about_torque(episode.metadata.get("mapping") or {}), *slow_sides(episode)),
+        doubts=tuple(about_torque(episode.metadata.get("mapping") or {})),
+        too_seldom=tuple(slow_sides(episode)),
     )
 
 

@@ -45,7 +45,7 @@ from sim2real.identification.uncertainty import (
 )
 from sim2real.identification.uncertainty import determined as what_is_determined
 from sim2real.identification.uncertainty import widening as posterior_widening
-from sim2real.identification.verdict import ACCEPTED, CHANGE, NO_DELAY, RECORD, Lack, scores, state_of
+from sim2real.identification.verdict import ACCEPTED, CHANGE, NO_DELAY, NOT_FINISHED, RECORD, Lack, scores, state_of
 from sim2real.log.importing.checks import slow_sides
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.identify.fitting import Fits, determined, has_parts, widened, without_parts
@@ -483,7 +483,7 @@ def _judged(
     )
     status, flags, why = judged.status, judged.next, list(judged.reasons)
     # No model explains a motion between commands that the log lacks.
-    if status == CHANGE and (slow := _slow_commands(inputs)):
+    if status in (CHANGE, NOT_FINISHED) and (slow := _slow_commands(inputs)):
         status, flags, why = RECORD, "", [slow, *why]
     if status == CHANGE and not (flags or lacks.unexplained) and _offers_more(inputs, fit):
         flags = "--terms auto"
