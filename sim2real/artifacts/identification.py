@@ -20,6 +20,7 @@ from sim2real.artifacts.files import (
     write_arrays,
     write_json,
 )
+from sim2real.artifacts.paths import shown
 from sim2real.artifacts.posterior import Posterior
 from sim2real.artifacts.run import Source
 from sim2real.artifacts.summary import ArtifactTable, Interval, Shown
@@ -35,6 +36,8 @@ _COLUMNS = ("t", "into", "segment", "recording", "held_out")
 _NO_LIMIT = 1e6
 """Value of an absent limit: ``worlds.drive_terms.NO_LIMIT``, whose module takes a second to import."""
 _AGAIN = "run `sim2real identify` again"
+_RUN = "{run}"
+"""Placeholder for the run's folder in the next command, as the folder may move."""
 
 
 @dataclass(frozen=True)
@@ -584,7 +587,8 @@ class Identification(Shown):
 
     def write(self, path: Path) -> None:
         """Write estimates and verdict as JSON, without samples and timing."""
-        write_json(path, self, without=("samples", "free", "replays", "timing"))
+        verdict = replace(self.verdict, next=self.verdict.next.replace(shown(path.parent.parent), _RUN))
+        write_json(path, replace(self, verdict=verdict), without=("samples", "free", "replays", "timing"))
 
     @staticmethod
     def load(path: Path | str) -> Identification:
@@ -609,6 +613,8 @@ class Identification(Shown):
         identification = read_versioned(file, Identification, _AGAIN, FORMAT)
         with malformed(file, _AGAIN):
             check(all(np.isfinite(p.estimate) for p in identification.parameters), "an estimate is no number")
+        following = identification.verdict.next.replace(_RUN, shown(file.parent.parent))
+        identification = replace(identification, verdict=replace(identification.verdict, next=following))
         # Files beside it may be missing: a copy of the estimates alone can be read.
         others: dict[str, Json] = {}
         if file.with_name(TIMING).is_file():
