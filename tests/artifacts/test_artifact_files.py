@@ -217,6 +217,15 @@ def test_a_folder_gives_back_what_was_saved(artifact, tmp_path):
     assert same(artifact, type(artifact).load(tmp_path))
 
 
+def test_the_next_command_names_the_run_in_which_the_file_lies(tmp_path):
+    before, after = tmp_path / "before", tmp_path / "after"
+    verdict = Judgement("accepted", (), f"sim2real train pendulum --run {before}")
+    replace(IDENTIFIED, verdict=verdict).save(before / "identify")
+    assert str(before) not in (before / "identify" / "parameters.json").read_text()
+    before.rename(after)
+    assert Identification.load(after / "identify").verdict.next == f"sim2real train pendulum --run {after}"
+
+
 DAMAGE = [
     (IDENTIFIED, "parameters.json", {"format": 2}, "format 2"),
     (IDENTIFIED, "parameters.json", {"parameters": [{"name": "gain"}]}, "parameters"),

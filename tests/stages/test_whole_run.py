@@ -118,12 +118,11 @@ def test_what_the_page_for_notebooks_has_runs(finished_run_dir, tmp_path, monkey
     had: dict = {}
     text = text.replace("runs/pendulum/TIME/record", str(finished_run_dir / "record"))
     patient = (
-        "pendulum = sim2real.load_robot('pendulum')\n"
-        "GATE = replace(pendulum.defaults.record.gate, servo_watchdog_s=0.4)\n"
+        "robot = sim2real.load_robot('pendulum')\nGATE = replace(robot.defaults.record.gate, servo_watchdog_s=0.4)\n"
     )
-    text = re.sub(r"^pendulum = .*$", patient, text, flags=re.MULTILINE)  # a busy machine is not what is tested
+    text = re.sub(r"^robot = .*$", patient, text, flags=re.MULTILINE)  # a busy machine is not what is tested
     exec(re.sub(r"duration_s=2.0", "duration_s=2.0, gate=GATE", text), had)
-    pendulum, recording, found = had["pendulum"], had["recording"], had["found"]
+    robot, recording, found = had["robot"], had["recording"], had["identification"]
     assert (tmp_path / "notebook" / "session.mcap").is_file()
     assert recording.units["th"] == "rad"
     assert found.values.keys() == sim2real.Identification.load(finished_run_dir / "identify").values.keys()
@@ -134,11 +133,11 @@ def test_what_the_page_for_notebooks_has_runs(finished_run_dir, tmp_path, monkey
     assert had["bundle"].contract.delays_s.keys() == {"sensor_delay", "actuator_delay"}
     assert len(had["deployment"].recordings) == len(had["deployment"].summary) == 1
     ppo = replace(had["small"], total_steps=256)
-    config = replace(pendulum.defaults.train, episode_s=2.0, timelines=4, ppo=ppo)
-    nominal = sim2real.train(pendulum, config=replace(config, model="nominal", sensitivity=False))
+    config = replace(robot.defaults.train, episode_s=2.0, timelines=4, ppo=ppo)
+    nominal = sim2real.train(robot, config=replace(config, model="nominal", sensitivity=False))
     assert (nominal.contract.delays_s, nominal.summary["timelines drawn again"]) == ({}, 0)
     with pytest.raises(UsageError, match="needs an identification"):
-        sim2real.train(had["robot"], config=config)
+        sim2real.train(robot, config=config)
     with pytest.raises(UsageError, match="another world, the robot's own, than 'moon'"):
         sim2real.train(had["robot"], found, replace(config, world="moon"))
 
