@@ -45,7 +45,7 @@ class Plant(Setting):
 class _Part:
     """A number of the plant: what the model says, and when another value is a fault.
 
-    It is one only if the replay without it, with all others estimated again, has an error larger by the dial's share.
+    It is one only if the replay without it has a clearly larger error, with all others estimated again.
     """
 
     dial: Dial
@@ -77,7 +77,7 @@ _DAMPING = Dial("", "", (1.0,), lambda f: f * np.array((0.8, 1.25)))
 def _of_one(joint: str) -> _Part:
     """Return the gain of one joint."""
     text = f"{joint} is {{value:.2f}} times as stiff as the contract says"
-    return replace(_PARTS["kp"], dial=replace(_PARTS["kp"].dial, text=text, least=0.2))
+    return replace(_PARTS["kp"], dial=replace(_PARTS["kp"].dial, text=text))
 
 
 _LIMITS = (0.05, 0.08, 0.12, 0.17, 0.24, 0.33, 0.45, 0.6)
@@ -156,10 +156,10 @@ class Drives:
         self.dof = np.array([self.model.joint(j).dofadr[0] for j in contract.joints])
         self.inertia = self.model.dof_M0[self.dof]
         # Other joints, such as the arms of a walking robot, have controllers of their own.
-        self.still = [n for n in names if self.model.joint(n).type[0] in _TURNING and n not in contract.joints]
-        for name in self.still:
-            dof = self.model.joint(name).dofadr[0]
-            self.model.dof_damping[dof] = 1e4 * self.model.dof_M0[dof]
+        others = [i for i in range(given.njnt) if int(given.jnt_type[i]) in _TURNING and i not in ids]
+        self.still = [names[i] or f"number {i}" for i in others]
+        dofs = given.jnt_dofadr[others]
+        self.model.dof_damping[dofs] = 1e4 * self.model.dof_M0[dofs]
         self.free = self.model.njnt > 0 and int(self.model.jnt_type[0]) == int(mujoco.mjtJoint.mjJNT_FREE)
         # The body that a payload adds to: the heaviest of a free robot, the outermost of a fixed one.
         moved = self.model.jnt_bodyid[[self.model.joint(j).id for j in contract.joints]]
@@ -379,7 +379,7 @@ def solve_plant(
     numbers, low = dict(fitted.numbers), replay.limited(fitted)
     # What may be a fault: its name, sentence, numbers, value, and share of the error without it.
     suspects = [
-        (part.dial.fault, part.dial.says(name)(fitted), [name], numbers[name], part.dial.least)
+        (part.dial.fault, part.dial.says(name)(fitted), [name], numbers[name], 0.07 if name == "kp" else 0.2)
         for name, part in {**_PARTS, **{f"kp {j}": _of_one(j) for j in drives.joints}}.items()
         if name in numbers and part.is_off(numbers[name])
     ]

@@ -142,7 +142,7 @@ def test_names_that_fit_no_joint_are_refused(tmp_path: Path) -> None:
 def test_terms_of_other_sizes_and_joints_without_an_action_are_said(tmp_path: Path) -> None:
     """Such as of a cart with a pole: the policy moves one joint, and sees two."""
     contract = Contract(50.0, JOINTS, 0.0, 0.3, (Term("joint_pos", size=5),), 40.0, 1.2)
-    toe = '<body pos="0 0 .1"><joint name="toe" axis="1 0 0"/><geom fromto="0 0 0 0 0 .1" mass=".1"/></body>'
+    toe = '<body><joint name="toe"/><joint axis="1 0 0"/><geom fromto="0 0 0 0 0 .1" mass=".1"/></body>'
     (tmp_path / "robot.xml").write_text(XML.replace("</body>", f"{toe}</body>", 1))
     time, rng = np.arange(200) / 50, np.random.default_rng(0)
     q = 0.1 * np.sin(time[:, None] * [2, 3, 4, 5])
