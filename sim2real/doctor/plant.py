@@ -286,6 +286,11 @@ class Replay:
             self._errors[plant] = error.sum((0, 1)) / self.used.sum()
         return self._errors[plant]
 
+    def sag(self, plant: Plant) -> np.ndarray:
+        """Return how far the joints of the robot are from the model's at the ends of the windows, with sign [rad]."""
+        last = self.used.shape[1] - 1 - np.argmax(self.used[:, ::-1], axis=1)
+        return -np.median(self.residuals(plant)[np.arange(len(last)), last], axis=0) * self.scale
+
     def candidates(self, plant: Plant) -> Iterator[Candidate[Plant]]:
         """Return what may be wrong beside what is known already."""
         delay_s, there = plant.number("delay_s", 0.0), dict(plant.numbers)
@@ -413,6 +418,7 @@ def solve_plant(
         **{n: fitted.number(n, part.usual) for n, part in _PARTS.items()}, "kd": fitted.number("kd"),
         "joints": {j: [float(a), float(b)] for j, a, b in
                    zip(contract.joints, replay.errors(nominal), replay.errors(fitted), strict=True)},
+        "sag_rad": dict(zip(contract.joints, replay.sag(nominal).tolist(), strict=True)),
         "parting": parting(replay, fitted, contract.joints),
     }  # fmt: skip
     return findings, figures

@@ -41,8 +41,10 @@ def write_diagnosis(folder: Path, diagnosis: Diagnosis, log: Log, name: str) -> 
         elif question == "timing":
             drawn = _periods(log, figures["trained_rate_hz"])
         else:
-            rows = [[j, number(a), number(b)] for j, (a, b) in figures["joints"].items()]
-            blocks.append(TableBlock("Error by joint, as a share of its motion", ("joint", "model", "fitted"), rows))
+            sag = figures["sag_rad"]
+            rows = [[j, number(a), number(b), number(1e3 * sag[j])] for j, (a, b) in figures["joints"].items()]
+            names = ("joint", "error of the model", "with what was found", "beside the model after 0.2 s [mrad]")
+            blocks.append(TableBlock("By joint; errors are shares of its motion", names, rows))
             blocks += [_parting(figures["parting"]), _poses(figures["parting"])]
             if own:
                 what = ", ".join(sorted({n for f in own for n in f.numbers})) or "the delay"
