@@ -101,16 +101,17 @@ class Link:
             return []
         chosen = [] if self.name == "normaliser" else explain(Making(), self.error, self.candidates, sound)
         error = self.error(chosen[-1].setting) if chosen else before
-        if self.name not in ("network", "normaliser") or error < max(_SOUND, 0.1 * before):
+        clear = error < 0.1 * before
+        if self.name not in ("network", "normaliser") or error < _SOUND or (clear and len(chosen) < 2):
             return chosen
-        # Another normaliser, alone or beside what was found, if it explains more.
+        # Another normaliser, if it explains more: alone, or beside what leaves much unexplained.
         tried = []
-        for count in sorted({0, min(1, len(chosen)), len(chosen)}):
+        for count in sorted({0} if clear else {0, min(1, len(chosen)), len(chosen)}):
             made = self._normaliser(chosen[count - 1].setting if count else Making())
             tried.append([*chosen[:count], Candidate("normaliser", made, _says("the observation is normalised with "
                                                                               "other numbers"))])  # fmt: skip
         best = min(tried, key=lambda c: self.error(c[-1].setting) * (1 + 0.1 * len(c)))
-        return best if self.error(best[-1].setting) < 0.5 * error else chosen
+        return best if self.error(best[-1].setting) < (_SOUND if clear else 0.5 * error) else chosen
 
     def _normaliser(self, how: Making) -> Making:
         """Return a making with the gain and the bias of each entry of the observation that fit best."""
