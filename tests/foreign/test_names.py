@@ -145,6 +145,15 @@ def test_columns_in_another_order_without_names_are_asked(tmp_path):
     assert proposed(tmp_path / "run.npz", as_told=True).questions == {}
 
 
+def test_a_unit_that_no_motion_proves_is_asked_until_the_flag_answers(tmp_path):
+    rng = np.random.default_rng(0)
+    np.savez(tmp_path / "run.npz", t_s=T, goal_rad=GOAL, q_rad=0.3 * rng.permutation(Q))
+    assert set(proposed(tmp_path / "run.npz").questions) == {("actuator", "goal", "unit")}
+    found = proposed(tmp_path / "run.npz", unit="rad")
+    assert found.questions == {}
+    assert any("no position follows" in line for line in found.evidence)
+
+
 def test_a_sign_is_asked_and_told_by_the_file(tmp_path):
     np.savez(tmp_path / "run.npz", t_s=T, goal_rad=GOAL * [1, -1], q_rad=Q)
     assert "[1.0, -1.0]" in proposed(tmp_path / "run.npz").questions["actuator", "goal", "scale"]

@@ -194,10 +194,13 @@ def check(
             findings.append(Finding(held.kind, i, held.text.format(m=m), held.weight))
     moving = [i for i, m in enumerate(measures) if m.moves]
     clock = _clock(t_s, goal, position, following or moving, acting)
+    rates = _rates(t_s, goal[:, moving], position[:, moving]) if moving else []
     if any(f.weight == "refuse" for f in clock):
         findings = [f for f in findings if f.kind not in ("follows", "lag")]
     elif moving and not following and not any(f.weight in ("refuse", "ask") for f in findings):
-        text = "no position follows its goal: units, signs, order and clocks are unproven"
+        # The cause is told first.
+        told = [*(f.text for f in rates), "no position follows its goal: units, signs, order and clocks are unproven"]
+        text = "; ".join(told)
         findings.append(Finding("follows", -1, text, "ask"))
     findings += clock
     if following:
@@ -208,9 +211,7 @@ def check(
         for i in moving:
             lag_s = measures[i].lag_s if i in following else None
             findings += _zero(t_s, goal[:, i], position[:, i], i, names[i], lag_s)
-    if moving:
-        findings += _rates(t_s, goal[:, moving], position[:, moving])
-    return findings + _scales(position, names)
+    return [*findings, *rates, *_scales(position, names)]
 
 
 def check_episode(episode: Episode, joints: Sequence[str] = (), by_name: bool = True) -> list[Finding]:

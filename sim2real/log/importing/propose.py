@@ -474,8 +474,11 @@ class Proposal:
             "source": f"{json.dumps(goal.sources)} in another order?",
         }
         for key in dict.fromkeys(keys[f.kind] for f in open_ones):
-            why = "; ".join(f.text for f in open_ones if keys[f.kind] == key)
-            if key == "unit":
+            asked = [f for f in open_ones if keys[f.kind] == key]
+            why = "; ".join(f.text for f in asked)
+            if self.hints.unit and all(f.kind == "follows" for f in asked):
+                self.evidence.append(f"warning: {why}")  # --unit has answered
+            elif key == "unit":
                 self.ask_unit(f"{why}; --as-told keeps it")
             else:
                 self.questions["actuator", "goal", key] = f"{candidates[key]}  # {why}; --as-told keeps the file's"
