@@ -6,7 +6,7 @@ Goals and measured positions in one unit are compared joint by joint: order, sig
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -54,94 +54,6 @@ class Finding:
     weight: Weight
 
 
-@dataclass(frozen=True)
-class JointMeasures:
-    """How one joint follows its own goal, and the goals of other joints."""
-
-    name: str
-    copied: bool  # its goals are copies of its measurements
-    moves: bool  # goal and position move
-    goal: float  # level of a goal that is held; NaN of one that moves
-    level: float  # of the position
-    r: float = 0.0  # correlation with the goal, at the best lag after it
-    slope: float = 1.0  # of the position over the goal, or over its opposite if it follows this better
-    misfit: float = 0.0  # error of the goal as a prediction, over the spread of the position
-    against: float = 0.0  # correlation with the opposite of the goal, negative
-    mirror: float = 0.0  # error of the opposite goal as a prediction
-    lag_s: float = 0.0
-    lead_r: float = 0.0  # correlation at the best lag of all, also before the goal
-    lead_s: float = 0.0  # by how much it moves before its goal at that lag
-    sample_s: float = 0.0
-    other: str = ""  # the other joint whose goal it follows best
-    other_r: float = 0.0
-    rival: int = -1  # a column whose goal it follows as well as its own; -1 without any
-    rival_r: float = 0.0
-
-    @property
-    def best(self) -> float:
-        """The larger correlation with the goal or its opposite."""
-        return max(self.r, -self.against)
-
-    @property
-    def is_held_elsewhere(self) -> bool:
-        """Whether it is held far from its goal: a weak servo sags, by less."""
-        return not self.moves and abs(self.goal) > 0.1 and abs(self.level - self.goal) > 0.5 * abs(self.goal)
-
-    @property
-    def sign(self) -> int:
-        """The sign with which it follows its goal; 0: either (a tone half a period later is its opposite)."""
-        plus = _is_clear(self.r, -self.against, self.misfit, self.mirror)
-        minus = _is_clear(-self.against, self.r, self.mirror, self.misfit)
-        return plus - minus
-
-    @property
-    def leads(self) -> bool:
-        """Whether it moves before its goal, and follows it clearly worse."""
-        if self.best < _FOLLOWS_R:
-            return self.lead_r > 0.9
-        return self.lead_s > 1.5 * self.sample_s and 1 - self.r > 3 * (1 - self.lead_r) + 0.005
-
-
-def _is_clear(r: float, other_r: float, misfit: float, other_misfit: float) -> bool:
-    """Return whether a goal fits clearly better than another one: by its shape, or by its level."""
-    by_level = misfit < 0.5 * other_misfit and other_misfit > 0.1
-    return 1 - other_r > 3 * (1 - r) + 0.02 or (by_level and r > _FOLLOWS_R)
-
-
-class _Check(NamedTuple):
-    kind: str
-    weight: Weight
-    holds: Callable[[JointMeasures], bool]
-    text: str
-
-
-_LEVEL = "{m.name} is held at {m.level:.3g} by a goal of {m.goal:.3g}: another sign, unit or zero"
-_SLOPE = "{m.name} follows its goal (r {m.r:.2f}) with a slope of {m.slope:.3g}: unit or scale of one of them is wrong"
-_LEADS = "{m.name} moves {m.lead_s:.3g} s before its goal: names are exchanged, or the clocks do not agree"
-JOINT_CHECKS = (
-    _Check("copy", "refuse", lambda m: m.copied,
-           "{m.name}: its goals are copies of its measurements, so they hold no information on the drive"),
-    _Check("sign", "ask", lambda m: m.is_held_elsewhere and abs(m.level + m.goal) < 0.3 * abs(m.goal), _LEVEL),
-    _Check("slope", "ask", lambda m: m.is_held_elsewhere, _LEVEL),
-    _Check("still", "warn", lambda m: not m.moves, "{m.name} hardly moves: sign, order and unit are not checked"),
-    _Check("order", "refuse", lambda m: m.other_r > 0.9 and m.best < 0.6,
-           "{m.name} follows the goal of {m.other} (r {m.other_r:.2f}), not its own (r {m.best:.2f})"),
-    _Check("order", "ask", lambda m: m.rival >= 0,
-           "{m.name} follows its own goal and that of column {m.rival} alike (r {m.best:.2f} and {m.rival_r:.2f})"),
-    _Check("lag", "refuse", lambda m: m.best < _FOLLOWS_R and m.leads, _LEADS),
-    _Check("follows", "warn", lambda m: m.best < _FOLLOWS_R,
-           "{m.name} does not follow its goal (r {m.best:.2f} at most): sign, unit and order are not checked"),
-    # A weak servo stays far behind its goal, but no servo goes far beyond it.
-    _Check("slope", "refuse", lambda m: not 0.15 < m.slope < 4.0, _SLOPE),
-    _Check("sign", "refuse", lambda m: m.sign < 0,
-           "{m.name} moves against its goal (r {m.against:.2f}): a sign of scale is wrong"),
-    _Check("slope", "ask", lambda m: m.sign > 0 and not 0.5 < m.slope < 1.6, _SLOPE),
-    _Check("lag", "refuse", lambda m: m.leads, _LEADS),
-    _Check("sign", "ask", lambda m: m.sign == 0,
-           "{m.name} fits its goal with either sign (r {m.r:.2f} and {m.against:.2f}): the motion repeats"),
-)  # fmt: skip
-"""What the measures of a joint show: the first check that holds counts; none holds of a joint that follows its goal."""
-
 _HINTS = {
     "overlap": "stamp_offset of the commands adds seconds to their clock, in a mapping",
     "sign": "change the sign of that joint's scale, such as scale = [1, -1]",
@@ -183,16 +95,10 @@ def check(
     if found is None:
         text = "the stamps of goals and positions overlap in fewer than 50 samples: nothing is checked"
         return [Finding("overlap", -1, text, "refuse")]
-    measures = [_measure(found, i, names, by_name, t_s, goal, position) for i in range(len(names))]
-    findings: list[Finding] = []
-    following: list[int] = []
-    for i, m in enumerate(measures):
-        held = next((c for c in JOINT_CHECKS if c.holds(m)), None)
-        if held is None:
-            following.append(i)
-        else:
-            findings.append(Finding(held.kind, i, held.text.format(m=m), held.weight))
-    moving = [i for i, m in enumerate(measures) if m.moves]
+    judged = [_judge(found, i, names, by_name, t_s, goal, position) for i in range(len(names))]
+    findings = [wrong for wrong, _, _ in judged if wrong is not None]
+    following = [i for i, (wrong, _, _) in enumerate(judged) if wrong is None]
+    moving = [i for i, (_, moves, _) in enumerate(judged) if moves]
     clock = _clock(t_s, goal, position, following or moving, acting)
     rates = _rates(t_s, goal[:, moving], position[:, moving]) if moving else []
     if any(f.weight == "refuse" for f in clock):
@@ -204,12 +110,12 @@ def check(
         findings.append(Finding("follows", -1, text, "ask"))
     findings += clock
     if following:
-        late = ", ".join(f"{names[i]} {1e3 * measures[i].lag_s:.0f} ms" for i in following[:6])
+        late = ", ".join(f"{names[i]} {1e3 * judged[i][2]:.0f} ms" for i in following[:6])
         text = f"positions follow their goals: {late}" + " ..." * (len(following) > 6)
         findings.append(Finding("follows", -1, text, "note"))
     if not any(f.weight == "refuse" for f in findings):
         for i in moving:
-            lag_s = measures[i].lag_s if i in following else None
+            lag_s = judged[i][2] if i in following else None
             findings += _zero(t_s, goal[:, i], position[:, i], i, names[i], lag_s)
     return [*findings, *rates, *_scales(position, names)]
 
@@ -259,8 +165,9 @@ class Response(NamedTuple):
 
     def misfit(self, joint: int, command: int, sign: float, r: float) -> float:
         """Return the error of a command, or of its opposite, as a prediction, over the spread of the position."""
-        size = self.spread[0][command] / self.spread[1][joint]
-        level = (self.mean[1][joint] - sign * self.mean[0][command]) / self.spread[1][joint]
+        spread = max(self.spread[1][joint], 1e-9)
+        size = self.spread[0][command] / spread
+        level = (self.mean[1][joint] - sign * self.mean[0][command]) / spread
         return float(np.sqrt(max(1 + size**2 - 2 * sign * r * size, 0.0) + level**2))
 
 
@@ -302,23 +209,31 @@ def respond(
     return Response(lags * period_s, r, cov / vx[:, None, :], (mean[0], mean[1]), (spread[0], spread[1]), sample_s)
 
 
-def _measure(found: Response, i: int, names: Sequence[str], by_name: bool, t_s: tuple[np.ndarray, np.ndarray],
-             goal: np.ndarray, position: np.ndarray) -> JointMeasures:  # fmt: skip
-    """Return the measures of a joint."""
-    level, moves = float(np.median(position[:, i])), bool(min(s[i] for s in found.spread) > _STILL)
-    lead_r, lead_s, _ = found.best(i, i, 1.0, _LAGS_S[0])
-    copied = lead_r > 0.95 and is_copy(t_s, goal[:, i], position[:, i], lead_s)
-    if copied or not moves:
-        held = float(np.median(goal[:, i])) if np.ptp(goal[:, i]) < 4 * _STILL else np.nan
-        return JointMeasures(names[i], copied, moves, held, level)
-    begin_s = -1.5 * found.sample_s
+def _judge(found: Response, i: int, names: Sequence[str], by_name: bool, t_s: tuple[np.ndarray, np.ndarray],
+           goal: np.ndarray, position: np.ndarray) -> tuple[Finding | None, bool, float]:  # fmt: skip
+    """Return what a joint's goals and positions contradict, None if it follows; whether it moves; and its lag [s]."""
+    name, begin_s = names[i], -1.5 * found.sample_s
+    moves = bool(min(s[i] for s in found.spread) > _STILL)
+    # A joint that is held: where, and by which goal. A weak servo sags, by less than half of its goal.
+    level, held = float(np.median(position[:, i])), float(np.median(goal[:, i]))
+    is_elsewhere = (
+        not moves and np.ptp(goal[:, i]) < 4 * _STILL and abs(held) > 0.1 and abs(level - held) > abs(held) / 2
+    )
+    # Its own goal, or the opposite, at the best lag after it; and at the best lag of all, also before it.
     r, lag_s, slope = found.best(i, i, 1.0, begin_s)
     against, _, mirrored = found.best(i, i, -1.0, begin_s)
-    slope = slope if r > -against else -mirrored
+    lead_r, lead_s, _ = found.best(i, i, 1.0, _LAGS_S[0])
+    best, slope = max(r, -against), slope if r > -against else -mirrored
     misfit, mirror = found.misfit(i, i, 1.0, r), found.misfit(i, i, -1.0, against)
-    # Compare with the goals of other joints, apart from those that equal its own, or its opposite.
-    own, others, rivals = max(r, -against), [], []
-    for j in range(len(names)):
+    # The sign is 0 if both fit: a tone half a period later is its opposite.
+    sign = _is_clear(r, -against, misfit, mirror) - _is_clear(-against, r, mirror, misfit)
+    leads = lead_r > 0.9
+    if best >= _FOLLOWS_R:
+        leads = -lead_s > 1.5 * found.sample_s and 1 - r > 3 * (1 - lead_r) + 0.005
+    # The goals of other joints, apart from those that equal its own, or its opposite.
+    others: list[tuple[float, int]] = []
+    rivals: list[tuple[int, float]] = []
+    for j in range(len(names) if moves else 0):
         if j == i or any(np.allclose(goal[:, i], s * goal[:, j], 1e-6, 1e-9) for s in (1, -1)):
             continue
         fits = [(found.best(i, j, sign, begin_s)[0], sign) for sign in (1.0, -1.0)]
@@ -326,14 +241,43 @@ def _measure(found: Response, i: int, names: Sequence[str], by_name: bool, t_s: 
         others.append((other_r, j))
         its = min(found.misfit(i, j, sign, r) for r, sign in fits)
         by_level = min(misfit, mirror) < 0.5 * its and its > 0.1
-        if not by_level and (1 - other_r <= 3 * (1 - own) + 0.02 or other_r > own + 0.02):
+        if not by_level and (1 - other_r <= 3 * (1 - best) + 0.02 or other_r > best + 0.02):
             rivals.append((j, other_r))
     other_r, other = max(others, default=(0.0, i))
-    rival, rival_r = rivals[0] if rivals and not by_name and max(own, other_r) >= _FOLLOWS_R else (-1, 0.0)
-    return JointMeasures(
-        names[i], False, True, np.nan, level, r, slope, misfit, against, mirror, lag_s, lead_r, -lead_s,
-        found.sample_s, names[other], other_r, rival, rival_r,
-    )  # fmt: skip
+    rival, rival_r = rivals[0] if rivals and not by_name and max(best, other_r) >= _FOLLOWS_R else (-1, 0.0)
+    copied = moves and lead_r > 0.95 and is_copy(t_s, goal[:, i], position[:, i], lead_s)
+    away = f"{name} is held at {level:.3g} by a goal of {held:.3g}: another sign, unit or zero"
+    scale = f"{name} follows its goal (r {r:.2f}) with a slope of {slope:.3g}: unit or scale of one of them is wrong"
+    before = f"{name} moves {-lead_s:.3g} s before its goal: names are exchanged, or the clocks do not agree"
+    checks: list[tuple[str, Weight, bool, str]] = [
+        ("copy", "refuse", copied,
+         f"{name}: its goals are copies of its measurements, so they hold no information on the drive"),
+        ("sign", "ask", is_elsewhere and abs(level + held) < 0.3 * abs(held), away),
+        ("slope", "ask", is_elsewhere, away),
+        ("still", "warn", not moves, f"{name} hardly moves: sign, order and unit are not checked"),
+        ("order", "refuse", other_r > 0.9 and best < 0.6,
+         f"{name} follows the goal of {names[other]} (r {other_r:.2f}), not its own (r {best:.2f})"),
+        ("order", "ask", rival >= 0,
+         f"{name} follows its own goal and that of column {rival} alike (r {best:.2f} and {rival_r:.2f})"),
+        ("lag", "refuse", best < _FOLLOWS_R and leads, before),
+        ("follows", "warn", best < _FOLLOWS_R,
+         f"{name} does not follow its goal (r {best:.2f} at most): sign, unit and order are not checked"),
+        # A weak servo stays far behind its goal, but no servo goes far beyond it.
+        ("slope", "refuse", not 0.15 < slope < 4.0, scale),
+        ("sign", "refuse", sign < 0, f"{name} moves against its goal (r {against:.2f}): a sign of scale is wrong"),
+        ("slope", "ask", sign > 0 and not 0.5 < slope < 1.6, scale),
+        ("lag", "refuse", leads, before),
+        ("sign", "ask", sign == 0, f"{name} fits its goal with either sign (r {r:.2f} and {against:.2f}): "
+         "the motion repeats"),
+    ]  # fmt: skip
+    wrong = next((Finding(kind, i, text, weight) for kind, weight, holds, text in checks if holds), None)
+    return wrong, moves, lag_s
+
+
+def _is_clear(r: float, other_r: float, misfit: float, other_misfit: float) -> bool:
+    """Return whether a goal fits clearly better than another one: by its shape, or by its level."""
+    by_level = misfit < 0.5 * other_misfit and other_misfit > 0.1
+    return 1 - other_r > 3 * (1 - r) + 0.02 or (by_level and r > _FOLLOWS_R)
 
 
 def _clock(
