@@ -82,9 +82,6 @@ class SessionFile:
         joint_states: Node -> joint -> quantity -> field of the node's output; see ``McapRecorder``.
         units: Node -> field, or entry of one -> unit.
 
-    Attributes:
-        counts: Topic -> number of messages written.
-
     Raises:
         Sim2RealError: As ``McapRecorder``.
     """
@@ -99,7 +96,6 @@ class SessionFile:
         joint_states: Mapping[str, Mapping[str, Mapping[str, str]]],
         units: Mapping[str, Mapping[str, str]] | None = None,
     ) -> None:
-        self.counts: dict[str, int] = {}
         self._nodes = _nodes(outputs, joint_states, units or {})
         self._inputs = _inputs(inputs, self._nodes)
         self._topics = self._all_topics()
@@ -222,7 +218,6 @@ class SessionFile:
         if channel is None:
             raise Sim2RealError("the log got data before the episode's start", hint="call start() first")
         self._writer.add_message(channel, log_time, payload, publish_time, sequence)
-        self.counts[topic.name] = self.counts.get(topic.name, 0) + 1
 
 
 def _nodes(
@@ -389,7 +384,7 @@ class McapRecorder:
         self._queue.put(None)
         self._wait(report)
         if self._error is None:
-            end = {**(summary or {}), "status": status, "exit_code": exit_code, "messages": self._file.counts}
+            end = {**(summary or {}), "status": status, "exit_code": exit_code}
             try:
                 self._file.finish(end)
             except (OSError, Sim2RealError) as error:

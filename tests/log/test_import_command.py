@@ -50,7 +50,7 @@ def test_each_file_becomes_a_run_with_the_pipelines_mapping(workplace, capsys):
 def test_the_page_of_an_imported_log_claims_nothing_that_was_not_measured(workplace):
     assert cli.main(["import", "one.npz", "--pipeline", "rig", "--out", "log.mcap"]) == 0
     episode = read_log("log.mcap")
-    assert set(episode.metadata["log"]["session_end"]) == {"status", "exit_code", "messages"}
+    assert set(episode.metadata["log"]["session_end"]) == {"status", "exit_code"}
     assert list(timing_tiles([episode])) == []
     assert timing_blocks(episode, "record") == []
     banner = record_banner(Signals(episode, [], [], {}))
