@@ -145,13 +145,19 @@ def joint_source(
     Raises:
         Sim2RealError: When a quantity, a field or an element does not exist.
     """
-    leaves = {name: np.asarray(leaf) for name, leaf in named_leaves(example).items()}
     quantities = ("position", "velocity", "effort")
+    known: dict[str, tuple[int, int]] = {}
+    for leaf, (name, value) in enumerate(named_leaves(example).items()):
+        known |= {f"{name}[{i}]": (leaf, i) for i in range(np.size(value))}
+        if np.size(value) == 1:
+            known[name] = leaf, 0
     for joint, sources in joints.items():
-        if unknown := set(sources) - set(quantities):
-            raise Sim2RealError(
-                f"joint {joint!r} of node {node!r} has no {sorted(unknown)[0]!r}. Available: {', '.join(quantities)}"
-            )
+        for quantity, source in sources.items():
+            if quantity not in quantities or source not in known:
+                raise Sim2RealError(
+                    f"joint {joint!r} reads {quantity} from {source!r} of node {node!r}. Available: "
+                    f"{', '.join(quantities)}, from {', '.join(known)}"
+                )
     # A message starts with the header and the joints' names, which are constants.
     picks: list[tuple[tuple[int, int], ...]] = []
     described: list[dict[str, Json]] = []
@@ -164,7 +170,7 @@ def joint_source(
     # Add an array for each quantity that some joint has.
     for quantity in quantities:
         present = any(quantity in sources for sources in joints.values())
-        elements = [_pick(node, joint, s.get(quantity), leaves) for joint, s in joints.items()] if present else []
+        elements = [known.get(s.get(quantity, ""), (-1, 0)) for s in joints.values()] if present else []
         picks.append(tuple(elements))
         parts.append(length(len(elements)))
         if elements:
@@ -216,26 +222,6 @@ def _scalars(units: Mapping[str, str]) -> str:
 
 def _field(entry: Mapping[str, Json]) -> CdrField:
     return CdrField(entry["original"], np.dtype(entry["dtype"]), tuple(entry["shape"]))
-
-
-def _pick(node: str, joint: str, source: str | None, leaves: Mapping[str, np.ndarray]) -> tuple[int, int]:
-    if source is None:
-        return -1, 0
-    # Split the source into a field and an element.
-    match = re.fullmatch(r"(.*)\[(\d+)\]", source)
-    name, element = (match[1], int(match[2])) if match else (source, 0)
-    if name not in leaves:
-        raise Sim2RealError(
-            f"joint {joint!r} reads {source!r}, but the output of node {node!r} has no field {name!r}. "
-            f"Available: {', '.join(leaves)}"
-        )
-    size = leaves[name].size
-    if element >= size or (match is None and size != 1):
-        raise Sim2RealError(
-            f"joint {joint!r} reads {source!r}, but field {name!r} of node {node!r} has {size} elements",
-            hint=f"name one of them: {name}[0] to {name}[{size - 1}]",
-        )
-    return list(leaves).index(name), element
 
 
 def _camel(name: str) -> str:
