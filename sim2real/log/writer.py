@@ -48,8 +48,8 @@ SYNC_PERIOD_S = 1.0
 # `close` waits for the writer in steps of WAIT_S, reports its progress after every so many of them, and gives up if the
 # writer writes nothing for STUCK_S.
 WAIT_S, REPORT_WAITS, STUCK_S = 0.2, 25, 60.0
-# Limit of the queue's memory [bytes], and memory of a queued record without its arrays.
-MAX_QUEUE_BYTES, RECORD_BYTES = 1 << 30, 500
+# Limit of the queue's memory [bytes], for a small computer too, and memory of a queued record without its arrays.
+MAX_QUEUE_BYTES, RECORD_BYTES = 1 << 28, 500
 LIBRARY = "sim2real"
 # Small, so that reading a range decompresses little, and a damaged byte costs little data.
 CHUNK_BYTES = 64 * 1024
@@ -320,7 +320,7 @@ class McapRecorder:
         sizes = [
             sum(np.asarray(leaf).nbytes for leaf in named_leaves(example).values()) for example in outputs.values()
         ]
-        self._most_waiting = _max_queue_bytes() // (RECORD_BYTES + max(sizes, default=0))
+        self._most_waiting = MAX_QUEUE_BYTES // (RECORD_BYTES + max(sizes, default=0))
         self._done = 0
         self._error: BaseException | None = None
         self._failed: Sim2RealError | None = None
@@ -486,14 +486,6 @@ def close_open_logs() -> None:
     for recorder in list(_open_logs):
         with contextlib.suppress(Sim2RealError):  # nobody could read it any more
             recorder.close("aborted", ERROR)
-
-
-def _max_queue_bytes() -> int:
-    """Return the limit of the queue's memory [bytes]: at most a quarter of the machine's memory."""
-    try:
-        return min(MAX_QUEUE_BYTES, os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 4)
-    except (AttributeError, ValueError, OSError):  # not on every platform
-        return MAX_QUEUE_BYTES
 
 
 def _snapshot(node: str, output: PyTree, expected: dict[str, None]) -> list[PyTree]:
