@@ -71,25 +71,7 @@ def test_version(capsys):
     assert capsys.readouterr().out.startswith("sim2real ")
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        "record",
-        "identify",
-        "train",
-        "deploy",
-        "run",
-        "demo",
-        "report",
-        "info",
-        "check",
-        "validate",
-        "import",
-        "new",
-        "export",
-        "play",
-    ],
-)
+@pytest.mark.parametrize("command", cli.COMMANDS)
 def test_every_command_has_help(capsys, command):
     assert cli.main([command, "--help"]) == 0
     out = capsys.readouterr().out
