@@ -202,4 +202,4 @@ def test_the_command_makes_a_log(tmp_path, capsys):
     episode = read_log(tmp_path / "y.mcap")
     is_right(episode)
     assert episode.metadata["log"]["epoch_ns"] == STAMPS_NS[0]
-    assert set(episode.metadata["log"]["session_end"]) == {"status", "exit_code", "messages"}
+    assert set(episode.metadata["log"]["session_end"]) == {"status", "exit_code"}

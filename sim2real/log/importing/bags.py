@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.exceptions import McapError
-from mcap.records import Channel, Header, Message, Metadata, Schema
+from mcap.records import Channel, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
+from mcap.writer import MCAP0_MAGIC
 
 from sim2real.errors import UsageError
 from sim2real.log.importing.readers import Table, refuse_container
 from sim2real.log.session import SESSION
+from sim2real.log.writer import LIBRARY
 
 _ZSTD = b"\x28\xb5\x2f\xfd"
 _IMAGES = ("Image", "PointCloud", "OccupancyGrid", "TFMessage", "CameraInfo", "LaserScan", "Marker")
@@ -23,17 +24,13 @@ _MAX_ENTRIES = 1000
 
 
 def is_ours(path: Path) -> bool:
-    """Return whether an MCAP file is a log of sim2real."""
+    """Return whether an MCAP file is a log of sim2real, by the library in its header."""
     try:
         with path.open("rb") as stream:
-            for n, record in enumerate(StreamReader(stream).records):
-                if isinstance(record, Metadata):
-                    return record.name == SESSION
-                if n > 2 or not isinstance(record, Header):
-                    return False
-    except (OSError, McapError, ValueError, struct.error):  # of a file of fewer than 8 bytes
-        pass
-    return False
+            head = stream.read(64)
+    except OSError:
+        return False
+    return head.startswith(MCAP0_MAGIC) and b"".join((struct.pack("<I", len(LIBRARY)), LIBRARY.encode())) in head
 
 
 def read_bag(path: Path) -> Table:
