@@ -18,17 +18,6 @@ from sim2real.training.ppo.losses import Batch, loss
 MEAN, LOG_STD = jnp.array([0.4]), jnp.array([-0.7])
 
 
-def test_density_is_that_after_the_change_of_variables():
-    """Its integral over the actions is 1, and over a part of them the share of samples there."""
-    edges = np.tanh(np.linspace(-9.0, 9.0, 4001))
-    middle = np.arctanh(np.tanh(np.linspace(-9.0, 9.0, 4001)[:-1] + 9.0 / 4000))
-    density = np.exp(jax.vmap(lambda u: log_prob(u, MEAN, LOG_STD, squash=True))(middle[:, None]))
-    mass = density * np.diff(edges)
-    assert mass.sum() == pytest.approx(1.0, abs=1e-3)
-    drawn = np.tanh(0.4 + np.exp(-0.7) * np.random.default_rng(0).normal(size=40_000))
-    assert mass[edges[1:] < 0.5].sum() == pytest.approx((drawn < 0.5).mean(), abs=0.01)
-
-
 def test_density_equals_that_of_distrax():
     distrax = pytest.importorskip("distrax")
     normal = distrax.MultivariateNormalDiag(jnp.array([0.4, -1.0]), jnp.array([0.5, 1.5]))

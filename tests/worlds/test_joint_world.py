@@ -104,17 +104,6 @@ def test_damping_alone_slows_exponentially(damping):
     np.testing.assert_allclose(position, 3.0 / damping * (1.0 - left), rtol=3e-4)
 
 
-def test_a_damped_oscillator_is_as_its_solution_says():
-    """Small angles, where the sine is its argument to 1e-9."""
-    damping, amplitude = 3.0, 1e-4
-    omega = math.sqrt(GRAVITY - damping**2 / 4)
-    with jax.enable_x64(True):
-        position, _ = swing(Pendulum("w", 100, substep_s=0.0005), (GRAVITY, damping, 0.0), (amplitude, 0.0), 200)
-    t = 0.01 * np.arange(1, 201)
-    expected = np.exp(-damping * t / 2) * (np.cos(omega * t) + damping / (2 * omega) * np.sin(omega * t))
-    np.testing.assert_allclose(position / amplitude, expected, atol=1e-5)
-
-
 def test_the_speed_at_which_damping_holds_a_push_is_exact_at_any_step():
     _, velocity = swing(Pendulum("w", 10, substep_s=0.1), (0.0, 8.0, 2.0), (0.0, 0.0), 100, 10.0)
     assert velocity[-1] == pytest.approx((10.0 - 2.0) / 8.0, rel=1e-6)

@@ -43,8 +43,3 @@ def test_joints_coast_as_the_equation_says_until_they_stick(width):
         np.testing.assert_allclose(speeds[turns, joint], expected[turns], atol=0.03)
     still = by_scipy(friction[0], width, t_s) < -0.05
     assert np.all(np.abs(speeds[still, 0]) < 1e-3), "it sticks where it stopped, held by all of the friction"
-
-
-def test_the_width_matters():
-    speeds = coasting({"frictionloss": np.full(2, 0.1), "stribeck_rad_s": np.array([0.3, np.inf])})
-    assert np.abs(np.diff(speeds)).max() > 0.5
