@@ -67,7 +67,7 @@ _PARTS = {
                       0.0, lambda share: abs(share) > 0.45),
     "payload": _Part(Dial("payload", "the robot carries {value:+.0%} of its mass beside the model's",
                           (-0.1, 0.1, 0.2, 0.4), lambda f: f + np.array((-0.05, -0.02, 0.02, 0.05)), 0.2),
-                     0.0, lambda share: abs(share) > 0.12),
+                     0.0, lambda share: abs(share) > 0.2),
 }  # fmt: skip
 _DELAY = Dial("delay", "", (0.0, 0.007, 0.014, 0.021, 0.028, 0.035, 0.045, 0.06),
               lambda s: np.maximum(0.0, s + np.array((-0.005, -0.0015, 0.0015, 0.005))))  # fmt: skip
