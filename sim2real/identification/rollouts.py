@@ -26,7 +26,7 @@ from sim2real.types import Array, MjModel, PyTree, Scalar
 from sim2real.worlds import rollouts as physics
 
 _NEEDED = ("open_loop", "fields", "start", "controls", "message")
-_ON_C, _COMPILED = (4, 24, 128, 512), (32, 256)
+_ON_C, _COMPILED = (4, 24, 48, 128, 512), (32, 256)
 """Copies in one call of a program. C: a Jacobian of 20 logs took 24 s of processor time with 128 at a time, 18 s with
 512. Compiled: each size is a program that contains the physics."""
 

@@ -7,7 +7,15 @@ from typing import Literal
 
 import numpy as np
 
-from sim2real.artifacts.identification import AHEAD, HELD_OUT, ComparedError, Judgement
+from sim2real.artifacts.identification import (
+    AHEAD,
+    HELD_OUT,
+    ComparedError,
+    ExpectedError,
+    Judgement,
+    with_small_unit,
+)
+from sim2real.identification.held_out import HeldOutPart
 from sim2real.identification.parameters import Parameter, ParameterTable
 from sim2real.identification.predictions import NOISE, Position, Prediction
 from sim2real.identification.uncertainty import ABSENT, BOUND, NOT_REACHED, OK, Determined, Uncertainty
@@ -25,6 +33,12 @@ _WIDER = 4.0
 """Factor between the old and the new bound on a logarithmic scale."""
 _LONGEST_S = 1.0
 """Longest delay that the flags allow [s]."""
+_SECOND = "record a second log like "
+"""Begin of an advice within a reason."""
+_ALONE = 0.99
+"""Share of the information on a parameter above which one part of the recordings determines it alone."""
+_APART = 2.0
+"""Ratio of the error on that part to that on each other one from which on it decides the expected error."""
 _BASELINES = {"no delay": "the model without delays", "hold": "standing still", "nominal": "the nominal model"}
 NO_DELAY = "no delay"
 """The same model fitted without delays. If it is as good, the data needs no delays; that is no failure."""
@@ -160,6 +174,33 @@ def state_of(verdict: str, p: Parameter, upper: bool) -> str:
     if verdict == BOUND:
         return "ok" if is_physical(p, upper) else verdict
     return "ok" if verdict in (OK, ABSENT) else "not determined"
+
+
+def decisive_part(parts: Sequence[HeldOutPart], expected: Sequence[ExpectedError]) -> str:
+    """Return a sentence about the part that decides the expected error as it alone determines parameters, or "".
+
+    A fit without that part has these parameters near their nominal values, and predicts the part far worse than a fit
+    of all recordings does.
+    """
+    for row in expected:
+        errors = [(part.ahead if row.kind == AHEAD else part.free).get(row.column) for part in parts]
+        sizes = [e if e is not None and math.isfinite(e) else 0.0 for e in errors]
+        order = sorted(range(len(parts)), key=lambda k: -sizes[k])
+        if len(parts) < 2 or sizes[order[0]] < _APART * sizes[order[1]] or sizes[order[0]] < row.error / _APART:
+            continue
+        part = parts[order[0]]
+        if names := [name for name, share in part.share.items() if share > _ALONE]:
+            error = f"{with_small_unit(row.error, row.unit)} {row.how}"
+            return (
+                f"{part.name} alone determines {', '.join(names)}: the expected error of {row.name}, {error}, is that "
+                f"of a fit without it; {_SECOND}{part.name}"
+            )
+    return ""
+
+
+def advised(reasons: Sequence[str]) -> str:
+    """Return which log to record as some reasons advise; "": none does."""
+    return next((_SECOND + reason.partition(_SECOND)[2] for reason in reasons if _SECOND in reason), "")
 
 
 def _not_converged(left: float) -> str:

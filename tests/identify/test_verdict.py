@@ -5,7 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from sim2real.artifacts.identification import AHEAD, ExpectedError
 from sim2real.identification import verdict
+from sim2real.identification.held_out import HeldOutPart
 from sim2real.identification.parameters import Parameter, ParameterTable
 from sim2real.identification.predictions import Position, Prediction
 from sim2real.identification.uncertainty import Determined
@@ -206,3 +208,17 @@ def test_a_term_that_halves_the_error_comes_before_a_parameter_that_nothing_dete
     found = judge(rows(0.1, 1.0), check=check(("gain",)), lacks=lacks)
     assert (found.status, found.next) == ("change the model", "--terms direction")
     assert found.reasons[0] == "direction lowers the error by 62%"
+
+
+@pytest.mark.parametrize(("share", "others"), [(0.995, 0.01), (0.6, 0.01), (0.995, 0.15)])
+def test_a_part_that_alone_determines_a_parameter_is_named_where_it_decides_the_expected_error(share, others):
+    shares = [{"gain": 0.3, "damping": (1.0 - share) / 2}, {"gain": 0.4, "damping": share}, {"gain": 0.3, "damping": 0}]
+    errors = (0.008, 0.2, others)
+    rows = zip("abc", shares, errors, strict=True)
+    parts = [HeldOutPart(name, (), {}, of, {"th": error, "tilt": None}) for name, of, error in rows]
+    expected = [ExpectedError(c, c, "rad", AHEAD, 1.0, 0.25) for c in ("tilt", "th")]
+    sentence = verdict.decisive_part(parts, expected)
+    assert bool(sentence) == (share > 0.99 and others < 0.1)
+    assert ("damping" in sentence) == bool(sentence)
+    assert "gain" not in sentence
+    assert verdict.advised(["another", sentence]).endswith(" b") == bool(sentence)

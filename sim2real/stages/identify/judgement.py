@@ -129,7 +129,8 @@ def judge(fits: Fits, started_s: float) -> Identification:
     open_ = [f"not determined by this log: {', '.join(names)}"] if names else []
     if fits.added:
         held.insert(0, f"the term {fits.added} is part of the model: without it the errors are at least twice as large")
-    return _judged(document, findings, inputs, [*held, *open_], lacks, set_by_user)
+    alone = verdict.decisive_part(parts, document.expected_error)
+    return _judged(document, findings, inputs, [*held, *open_, *([alone] if alone else [])], lacks, set_by_user)
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from sim2real.artifacts.identification import PARAMETERS, Identification
 from sim2real.artifacts.run import OpenStage, StageFolder, newest, open_stage
 from sim2real.errors import UsageError
 from sim2real.identification.uncertainty import noises
+from sim2real.identification.verdict import advised
 from sim2real.robots.robot import RecordedRobot, Robot
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.identify.fitting import fit_model
@@ -124,13 +125,15 @@ def _write(identification: Identification, stage: OpenStage, robot: RecordedRobo
 def _following(robot: RecordedRobot, stage: OpenStage, identification: Identification) -> str:
     """Return what to do where no flags of identify follow from the verdict."""
     name, folder, status = robot.name, shlex.quote(shown(stage.folder)), identification.verdict.status
+    advice = advised(identification.verdict.reasons)
+    first = f"{advice}, or " if advice else ""
     if status == "record again" and robot.folder is not None:
-        return f"sim2real check {name}, which says what motion determines the parameters"
+        return f"{first}sim2real check {name}, which says what motion determines the parameters"
     if status != "accepted" or robot.folder is None:
-        return "look at the reason; no flag changes it" if status != "accepted" else ""
+        return "look at the reason; no flag changes it" if status != "accepted" else advice
     if isinstance(robot, Robot):
-        return f"sim2real train {name} --run {shlex.quote(shown(stage.run_dir))}"
-    return f"sim2real validate {folder} --log LATER_LOG, or sim2real export {folder}"
+        return f"{first}sim2real train {name} --run {shlex.quote(shown(stage.run_dir))}"
+    return f"{first}sim2real validate {folder} --log LATER_LOG, or sim2real export {folder}"
 
 
 def _begin(path: str, robot: RecordedRobot) -> dict[str, float]:
