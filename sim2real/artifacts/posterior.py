@@ -12,12 +12,11 @@ from sim2real.artifacts.files import check
 if TYPE_CHECKING:
     from types import ModuleType
 
-Transform = Literal["linear", "log", "logit"]
+Transform = Literal["linear", "log"]
 TRANSFORMS = {
     # value -> scale (numpy); scale -> value (numpy or JAX); d value / d scale, as a function of the value
     "linear": (lambda v: v, lambda x, m: x, lambda v: 1.0 + 0.0 * v),
     "log": (np.log, lambda x, m: m.exp(x), lambda v: v),
-    "logit": (lambda v: np.log(v / (1.0 - v)), lambda x, m: 1.0 / (1.0 + m.exp(-x)), lambda v: v * (1.0 - v)),
 }
 """Scales of the search; on its scale, the uncertainty of a parameter is Normal."""
 

@@ -5,8 +5,6 @@ from typing import Literal
 
 from sim2real.errors import UsageError
 
-Loss = Literal["squared", "huber", "cauchy"]
-
 
 @dataclass(frozen=True)
 class FitConfig:
@@ -18,10 +16,8 @@ class FitConfig:
     """State at a segment's start: 'free' fits it, 'measured' reads it off the samples, 'rest' has no velocity."""
     skip_s: float = 0.0
     """First part of a segment that is simulated but not compared, so that unmeasured states settle [s]."""
-    loss: Loss = "huber"
-    """Loss of a residual; 'huber' and 'cauchy' are robust."""
     reach: float = 5.0
-    """Residual above which a robust loss grows more slowly than the square [deviations of the measurement]."""
+    """Residual above which the loss grows more slowly than its square [deviations of the measurement]; inf: nowhere."""
     strategy: str = "CMA_ES"
     """Search algorithm: any name in evosax.algorithms."""
     population: int = 32
@@ -31,7 +27,7 @@ class FitConfig:
     std: float = 0.7
     """Spread of the first generation; 1 covers about half of the bounds' width."""
     refine_steps: int = 25
-    """Largest number of steps of Levenberg-Marquardt in a round, of which there are up to four; 0 skips them."""
+    """Largest number of steps of Levenberg-Marquardt in a round, of which there are up to four."""
     long_s: float | None = 0.0
     """Length of the segments of a last refinement [s]; 0, or logs shorter than two of them, skip it. None: 5 s if no
     goals of positions are commanded, as errors of a force add up in a free run, else 0."""
@@ -51,15 +47,15 @@ class FitConfig:
                 "the search needs a population of 4 at least, and no negative number of generations, got "
                 f"{self.population} and {self.generations}"
             )
-        if self.generations == 0 and self.refine_steps == 0:
-            raise UsageError("generations and refine_steps are both 0: no parameter would be identified")
         if not 1e-5 <= self.difference <= 0.2:
             raise UsageError(f"difference must lie in [0.00001, 0.2], got {self.difference}")
         if not (self.reach > 0.0 and self.std > 0.0):
             raise UsageError(f"reach and std must be above 0, got {self.reach} and {self.std}")
         if not 0.0 <= self.skip_s <= 10.0:
             raise UsageError(f"skip_s must lie in [0, 10] s, got {self.skip_s}")
-        if min(self.refine_steps, self.long_s or 0.0) < 0:
-            raise UsageError("refine_steps and long_s must not be negative")
+        if self.refine_steps < 1 or (self.long_s or 0.0) < 0:
+            raise UsageError(
+                f"refine_steps must be 1 at least and long_s not negative, got {self.refine_steps} and {self.long_s}"
+            )
         if not 0 <= self.seed < 2**31:
             raise UsageError(f"seed must lie in [0, 2**31), got {self.seed}")

@@ -31,7 +31,7 @@ _ROUGHLY = 0.05
 """Relative gain of the loss in a step at which a descent ends that only finds a start."""
 _COARSE = 1e-3
 """Relative gain of the loss at which the descent from each start ends; that from the best start continues."""
-_ROUGH = 1e-2
+ROUGH = 1e-2
 """The same for a model that others are compared with by percents."""
 _NEARLY, _APART = 1.5, 0.02
 """Ratio of two losses after a rough descent up to which both starts are followed, if their ends are farther apart than
@@ -42,8 +42,6 @@ _NEAR = 1e-5
 """Relative change of the point at which a descent ends, if the differences resolve it."""
 _LEFT = 0.1
 """A descent has converged if the next Gauss-Newton step is shorter [standard errors]."""
-_CONVERGED = 0.5
-"""The same for a fit without a descent."""
 _POLLED, _AWAY, _BETTER = 12, 0.5, 1e-3
 """Points that are tried around a descent that ended with more left; how far away [standard errors]; and by which share
 their loss must be lower. Where friction sticks, the derivative at a point does not describe the points around it."""
@@ -151,15 +149,13 @@ def fit(
         on_begin(problem)
     # Refine from the nominal values, too, with short and with long delays: a delay may imitate an inertia.
     starts, result = problem.table.starts() if end is None else end[None], None
-    x, loss = starts[0], float("nan")
     # Search globally; its best candidate is a further start of the refinement.
     if config.generations and end is None:
         result = run_search(problem, starts[0], report)
         starts = np.stack([result.x, *starts])
-        x, loss = result.x, result.loss
     # Refine by least squares, first on windows, then on long segments.
-    longer, refined = bool(config.refine_steps and config.long_s and long_spans), None
-    if config.refine_steps and (end is None or not longer):
+    longer = bool(config.long_s and long_spans)
+    if end is None or not longer:
         # Where all segments take long, the best of several descents on some of them begins the descent on all.
         few = few_of(problem) if end is None else problem
         if few is not problem:
@@ -167,15 +163,13 @@ def fit(
         refined = _refine(problem, starts, report)
         if end is None:
             refined = _at_other_delays(problem, refined, report)
+        if not longer:
+            return Fit(problem, refined.x, refined.loss, result, windows, refined.left, refined.converged)
         starts = refined.x[None]
-    if longer:
-        problem = windows.recut(long_spans, config.long_s or 0.0)
-        problem = thinned(problem, of_recordings(problem), MOST_OF_FIT)
-        refined = _refine(problem, starts, report)
-    if refined is not None:
-        return Fit(problem, refined.x, refined.loss, result, windows, refined.left, refined.converged)
-    left = remaining(problem, x)
-    return Fit(problem, x, loss, result, windows, left, left < _CONVERGED)
+    problem = windows.recut(long_spans, config.long_s or 0.0)
+    problem = thinned(problem, of_recordings(problem), MOST_OF_FIT)
+    refined = _refine(problem, starts, report)
+    return Fit(problem, refined.x, refined.loss, result, windows, refined.left, refined.converged)
 
 
 def _at_other_delays(problem: Problem, found: Refined, report: OnProgress | None) -> Refined:
@@ -201,8 +195,8 @@ def _at_other_delays(problem: Problem, found: Refined, report: OnProgress | None
             # The others move as the linear model says; one that nothing determines stays.
             start[others] -= np.linalg.lstsq(J[:, others], J[:, i] * (start[i] - x[i]), rcond=1e-6)[0]
             starts.append(table.within(start))
-        other = refine(problem, np.stack(starts), lively, coarse=True)
-        if not other.loss < (1.0 - _ROUGH) * problem.loss(x, lively):
+        other = refine(problem, np.stack(starts), lively, gain=ROUGH)
+        if not other.loss < (1.0 - ROUGH) * problem.loss(x, lively):
             break
         better = _refine(problem, other.x[None], report)
         if not better.loss < found.loss:
@@ -232,7 +226,7 @@ def refit(problem: Problem, present: np.ndarray, near: np.ndarray) -> dict[str, 
     starts = table.within(np.stack([near + moved, near, table.start()]))
     losses = np.nan_to_num([few.loss(x, part) for x in starts], nan=np.inf)
     best = starts[int(np.argmin(losses))]
-    return as_numbers(table, refine(few, best[None], part, coarse=True).x, present)
+    return as_numbers(table, refine(few, best[None], part, gain=ROUGH).x, present)
 
 
 def run_search(problem: Problem, start: np.ndarray, report: OnProgress | None = None) -> SearchResult:
@@ -263,8 +257,6 @@ def refine(
     problem: Problem,
     starts: np.ndarray,
     part: Part | None = None,
-    coarse: bool = False,
-    settle: bool = True,
     gain: float | None = None,
     on_step: OnStep | None = None,
     slopes: int | None = None,
@@ -274,9 +266,8 @@ def refine(
     Args:
         starts: Shape ``(K, P)``.
         part: Segments and parameters to fit; default: all.
-        coarse: Whether the first descents suffice, to compare with a model by percents.
-        settle: Whether the end is tested, and points around it are tried if it is no minimum.
-        gain: Relative gain of the loss at which the first descents end; default: by the other arguments.
+        gain: Relative gain of the loss at which the descent ends, without a test whether that is a minimum; default: at
+            a minimum, which is tested.
         slopes: Most Jacobians of a round that are computed, not corrected, and few steps; default: as many as it needs.
     """
     descent = _Descent(problem, part or problem.part(), on_step, slopes)
@@ -288,17 +279,16 @@ def refine(
             hint="search first, with generations above 0, or check the nominal values",
         )
     # Descend roughly from each start, and further from those that may lead to the best end.
-    fine = problem.residuals.precision
-    first_gain = gain or (_ROUGH if coarse else _COARSE if settle else fine)
-    ends = [(x, 0.0) for x in starts[np.isfinite(first)]]
+    fine, first_gain = problem.residuals.precision, gain or _COARSE
+    ends = list(starts[np.isfinite(first)])
     if len(ends) > 1:
-        rough = sorted((descent.down(x, max(_ROUGHLY, first_gain)) for x, _ in ends), key=lambda end: end[1])
-        ends = rough[:1]
+        rough = sorted((descent.down(x, max(_ROUGHLY, first_gain)) for x in ends), key=lambda end: end[1])
+        ends = [rough[0][0]]
         for x, loss in rough[1:]:
-            apart = min(float(np.max(np.abs(x - y) / problem.table.span)) for y, _ in ends)
-            ends += [(x, loss)] if loss < _NEARLY * rough[0][1] and apart > _APART else []
-    x, loss = min((descent.down(x, first_gain) for x, _ in ends), key=lambda end: end[1])
-    if coarse or not settle:
+            apart = min(float(np.max(np.abs(x - y) / problem.table.span)) for y in ends)
+            ends += [x] if loss < _NEARLY * rough[0][1] and apart > _APART else []
+    x, loss = min((descent.down(x, first_gain) for x in ends), key=lambda end: end[1])
+    if gain is not None:
         return Refined(x, loss, np.nan, False)
     # Descend from the best end to the minimum.
     x, loss = descent.down(x, fine)
@@ -435,7 +425,7 @@ class _Descent:
 
         def normal(y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             """Return the robust residuals, half the gradient and half the second derivatives without the pull."""
-            r, stretch = robust(there.residuals(y), config.loss, config.reach)
+            r, stretch = robust(there.residuals(y), config.reach)
             J = stretch[:, None] * there.jacobian(y)
             return r, J.T @ r, J.T @ J
 
@@ -448,7 +438,7 @@ class _Descent:
             return x
         # Pull to the nominal values by the residuals that the next step leaves, if the slope is right.
         shape, priors = (len(self._part.live), -1, len(problem.fields)), sum(c.prior is not None for c in table.columns)
-        stretch = robust(there.residuals(x), config.loss, config.reach)[1]
+        stretch = robust(there.residuals(x), config.reach)[1]
         left = r + stretch * (there.jacobian(x) @ step)
         compared = problem.residuals.compared(self._part)
         self._deviation = deviation(left[: len(left) - priors].reshape(shape), compared)
@@ -462,7 +452,7 @@ class _Descent:
             predicted = -(2.0 * G @ step + step @ (H + np.diag(pull)) @ step)
             raw = there.residuals(y + step)
             self._report(np.inf, y + step)
-            new = robust(raw, config.loss, config.reach)[0]
+            new = robust(raw, config.reach)[0]
             after = float(new @ new) + float(pull @ (y + step - self._nominal) ** 2)
             gained = cost - after if np.isfinite(after) else -np.inf
             if not gained > 0.0:

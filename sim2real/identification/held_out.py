@@ -228,7 +228,7 @@ def refitted(problem: Problem, stats: Statistics, touched: np.ndarray, present: 
     for k, segments in enumerate(touched):
         start = stats.x + stats.step(table, present, np.arange(len(touched)) == k)
         rest = problem.part(problem.train[segments], table.of_terms(present))
-        ends.append(refine(problem, start[None], rest, settle=False, gain=_GAIN, slopes=_SLOPES).x)
+        ends.append(refine(problem, start[None], rest, gain=_GAIN, slopes=_SLOPES).x)
     return ends
 
 

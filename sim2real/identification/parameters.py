@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 from sim2real.artifacts.posterior import TRANSFORMS, Posterior, Transform, from_scale
 from sim2real.errors import UsageError
 from sim2real.identification.parameter_paths import set_leaf
-from sim2real.later import jax, jnp
 from sim2real.types import PyTree
 
 _BELOW, _BEYOND = 4.0, 50.0
@@ -31,12 +30,12 @@ class Parameter:
         name: Unique in its table.
         unit: Unit of nominal value and bounds.
         nominal: Value of the data sheet; of a delay, the value in a model without delays.
-        transform: Scale of the search: ``linear``, ``log`` (positive values) or ``logit`` (shares).
+        transform: Scale of the search: ``linear``, or ``log`` for positive values.
         kind: ``dynamics``, ``delay``, or ``measurement`` (an encoder's offset, a clock's).
         about: One line for tables and pages.
         excite: Motion that determines it, for advice; "": no advice.
         leaf: Place of the value in the nodes' parameters, ``node.field.field[index]``; None: the model places it.
-        prior: A distrax distribution over the value; None: uniform on the scale, within the bounds.
+        prior: Mean and deviation of a normal distribution of the value; None: uniform on the scale, within the bounds.
         free: Whether it is identified; else it stays at ``nominal``.
         side: Of a delay: ``command`` (from the policy to the world) or ``measurement`` (from the world to the policy).
         term: Name of the optional term of the model that it belongs to, such as ``cogging``; "": none.
@@ -59,7 +58,7 @@ class Parameter:
     kind: Literal["dynamics", "delay", "measurement"] = "dynamics"
     about: str = ""
     leaf: str | None = None
-    prior: Any = None
+    prior: tuple[float, float] | None = None
     free: bool = True
     side: Literal["", "command", "measurement"] = ""
     term: str = ""
@@ -83,22 +82,15 @@ class Parameter:
             raise UsageError(
                 f"parameter {self.name!r}: a logarithmic scale needs a positive lower bound, got {self.low}"
             )
-        if self.transform == "logit" and not 0.0 < self.low < self.high < 1.0:
-            raise UsageError(f"parameter {self.name!r}: a logit scale needs bounds within (0, 1)")
         # Value of an absent term, and the prior.
         if self.off is not None and not (self.term and math.isfinite(self.off)):
             raise UsageError(
                 f"parameter {self.name!r}: off = {self.off} is its value without a term, and its term is {self.term!r}",
                 hint="name the term, and a finite value",
             )
-        if self.prior is not None and not callable(getattr(self.prior, "log_prob", None)):
+        if self.prior is not None and not (math.isfinite(self.prior[0]) and 0.0 < self.prior[1] < math.inf):
             raise UsageError(
-                f"parameter {self.name!r}: the prior {self.prior!r} has no log_prob",
-                hint="pass a distrax distribution over the value",
-            )
-        if self.prior is not None and not _has_mode(self.prior):
-            raise UsageError(
-                f"parameter {self.name!r}: the prior {type(self.prior).__name__} has no single, finite mode",
+                f"parameter {self.name!r}: the prior {self.prior} is no mean and deviation of a normal distribution",
                 hint="remove the prior: without one it is uniform within the bounds",
             )
 
@@ -300,9 +292,9 @@ class ParameterTable:
         return self.encode({p.name: p.nominal for p in self.parameters})
 
     def prior_residuals(self, x: np.ndarray) -> np.ndarray:
-        """Return residuals ``(Q,)`` at ``x (P,)`` whose half sum of squares is minus the log prior, but a constant."""
-        with_prior = [(i, c) for i, c in enumerate(self.columns) if c.prior is not None]
-        return np.array([_prior_residual(c.prior, c.from_scale(x[i])) for i, c in with_prior])
+        """Return the residuals of the priors at ``x (P,)``, ``(Q,)``: distances from the mean in deviations."""
+        pulls = [(i, c, *c.prior) for i, c in enumerate(self.columns) if c.prior is not None]
+        return np.array([(c.from_scale(x[i]) - mean) / deviation for i, c, mean, deviation in pulls])
 
     def unscale(self, x: np.ndarray) -> np.ndarray:
         """Return values for points on the parameters' scales ``(..., P)``, clipped to the bounds."""
@@ -329,24 +321,3 @@ class ParameterTable:
     def span(self) -> np.ndarray:
         """Width of the bounds on the parameters' scales, ``(P,)``."""
         return self._high - self._low
-
-
-def _prior_residual(prior: Any, value: float) -> float:
-    """Return the residual of a distrax distribution: exact for a Normal, else the root of the drop from the mode."""
-    if type(prior).__name__ == "Normal":
-        return float((value - prior.loc) / prior.scale)
-    mode = float(np.asarray(prior.mode()))
-    off = value - mode
-    # Close to the mode the drop is lost in rounding, and the curvature is used.
-    curvature = -float(jax.grad(jax.grad(lambda v: jnp.sum(prior.log_prob(v))))(jnp.float32(mode)))
-    if curvature > 0.0 and off**2 * curvature < 1e-4:
-        return float(off * np.sqrt(curvature))
-    drop = float(np.sum(np.asarray(prior.log_prob(jnp.float32(mode)) - prior.log_prob(jnp.float32(value)))))
-    return float(np.sign(off) * np.sqrt(2.0 * max(drop, 0.0)))
-
-
-def _has_mode(prior: Any) -> bool:
-    try:
-        return bool(np.all(np.isfinite(np.asarray(prior.mode()))))
-    except (AttributeError, NotImplementedError):
-        return False

@@ -22,7 +22,7 @@ from sim2real.identification.model import Channel, IdentifiableModel
 from sim2real.identification.parameters import ParameterTable
 from sim2real.identification.residuals import Linearised, Part, Residuals
 from sim2real.identification.rollouts import Engine, Rollouts, choose_engine
-from sim2real.identification.segments import Data, Retimed, Span, cut, data_of, padded, rounded
+from sim2real.identification.segments import Data, Span, cut, data_of, padded, rounded
 
 MOST_OF_FIT = 4e7
 """Steps of single joints in a Jacobian from which a fit takes fewer segments: about 30 s on two cores."""
@@ -39,7 +39,6 @@ class Problem:
 
     Args:
         length_s: Length of a segment [s].
-        moved: Changes the recorded timing of the segments before they are simulated.
         like: Another problem of the same model, table and configuration; both share programs.
 
     Attributes:
@@ -63,7 +62,6 @@ class Problem:
         length_s: float,
         config: FitConfig = FitConfig(),  # noqa: B008 - frozen
         table: ParameterTable | None = None,
-        moved: Retimed = lambda recorded: recorded,
         like: Problem | None = None,
     ) -> None:
         self.model, self.config, self._recordings = model, config, recordings
@@ -74,7 +72,7 @@ class Problem:
         cuts = cut(model, nodes, recordings, spans, length_s, 2 * config.max_delay_s)
         self.spans, self.segment_s, self.messages = cuts.spans, length_s, cuts.messages
         # Complete the recorded timing: draw the steps of the simulated nodes.
-        self.timeline = draw(nodes, length_s + model.ahead_s, recorded=moved(cuts.timeline))
+        self.timeline = draw(nodes, length_s + model.ahead_s, recorded=cuts.timeline)
         make_room(nodes, self.timeline)  # after a hiccup commands leave in a burst
         # Number the segments.
         self.segments = len(cuts.spans)
@@ -176,20 +174,14 @@ class Problem:
         other._begin_residuals(self.residuals)
         return other
 
-    def recut(
-        self,
-        spans: Sequence[Span],
-        length_s: float,
-        moved: Retimed = lambda recorded: recorded,
-        ends_s: Sequence[float] | None = None,
-    ) -> Problem:
+    def recut(self, spans: Sequence[Span], length_s: float, ends_s: Sequence[float] | None = None) -> Problem:
         """Return the same recordings cut into other segments; both problems share programs.
 
         Args:
             length_s: Length of a segment [s].
             ends_s: Time in each segment after which measurements are not compared [s]; default: ``length_s``.
         """
-        other = Problem(self.model, self._recordings, spans, length_s, self.config, moved=moved, like=self)
+        other = Problem(self.model, self._recordings, spans, length_s, self.config, like=self)
         if ends_s is not None:
             ends = dict(zip(spans, ends_s, strict=True))
             until = np.array([ends[span] for span in other.spans])

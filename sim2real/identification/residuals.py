@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from sim2real.identification.config import Loss
 from sim2real.identification.rollouts import Rollouts
 from sim2real.identification.segments import Data
 from sim2real.types import MjModel
@@ -215,7 +214,7 @@ class Residuals:
         both = self._raw(np.concatenate([high, low]), states, part)
         width = np.clip(x + self._step, None, self._table.high) - np.clip(x - self._step, self._table.low, None)
         J = self._groups.spread(both[: len(groups)] - both[len(groups) :], groups, len(x)) / width
-        r, slope = robust(raw, self._config.loss, self._config.reach)
+        r, slope = robust(raw, self._config.reach)
         prior, of_prior = self._prior(x), self._prior_slope(x)
         precision = of_prior.T @ of_prior + np.diag(12.0 / self._table.span**2)
         loss = self._loss(r, prior, part)
@@ -230,9 +229,8 @@ class Residuals:
     def losses(self, candidates: np.ndarray, middle: np.ndarray, part: Part) -> np.ndarray:
         """Return the loss of each candidate ``(N, P)``, with initial states linearised at ``middle (P,)``."""
         raw = self._raw(candidates, self._fitted_states(middle, part), part)
-        loss, reach = self._config.loss, self._config.reach
-        rows = zip(raw, candidates, strict=True)
-        return np.array([self._loss(robust(r, loss, reach)[0], self._prior(x), part) for r, x in rows])
+        rows = zip(robust(raw, self._config.reach)[0], candidates, strict=True)
+        return np.array([self._loss(r, self._prior(x), part) for r, x in rows])
 
     def near(self, x: np.ndarray, part: Part, slopes: int | None = None) -> Nearby:
         """Return the residuals near ``x`` for a descent; initial states keep their slopes at ``x``.
@@ -277,7 +275,7 @@ class Residuals:
     def robustly(self, points: np.ndarray, x: np.ndarray, part: Part) -> np.ndarray:
         """Return the robust residuals ``(N, S, K, F)`` at points ``(N, P)``; initial states are linearised at ``x``."""
         raw = self._raw(points, self._fitted_states(x, part, fresh=True), part)
-        return robust(raw, self._config.loss, self._config.reach)[0]
+        return robust(raw, self._config.reach)[0]
 
     def liveliest(self, part: Part, most: int | None = None) -> Part:
         """Return the segments in which the channels move most, of each channel in turn.
@@ -463,20 +461,14 @@ def _state_cost(at: _States, counts: np.ndarray) -> np.ndarray:
     return np.sum(np.where(counts, at.residuals, 0.0) ** 2, axis=(1, 2)) + np.sum(at.shift**2, axis=1)
 
 
-def robust(raw: np.ndarray, loss: Loss, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return residuals whose half square is scipy's robust loss of the given ones, and their derivative.
+def robust(raw: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return residuals whose half square is a robust loss of the given ones, and their derivative.
 
-    ``huber`` is scipy's ``soft_l1``: squared below ``reach``, linear far above it. ``cauchy`` grows with the logarithm.
+    The loss is scipy's ``soft_l1``: squared below ``reach``, linear far above it.
     """
-    if loss == "squared":
-        return raw, np.ones_like(raw)
-    if loss == "huber":  # by hypot: a square may overflow to infinity, which would make the residual 0
-        root = np.hypot(1.0, raw / reach)
-        share = np.sqrt(2.0 / (root + 1.0))
-        return raw * share, 1.0 / (root * share)
-    square = np.maximum((raw / reach) ** 2, 1e-12)
-    share = np.sqrt(np.log1p(square) / square)
-    return raw * share, 1.0 / ((1.0 + square) * share)
+    root = np.hypot(1.0, raw / reach)  # a square may overflow to infinity, which would make the residual 0
+    share = np.sqrt(2.0 / (root + 1.0))
+    return raw * share, 1.0 / (root * share)
 
 
 class Nearby:

@@ -23,8 +23,6 @@ _LEAST_SAMPLES = 4
 GRID_S = 0.1
 """Segments and held-out parts begin at multiples of this after the first one: a world that takes messages at its steps
 would take those of a regular log at other times in a segment that begins between two multiples."""
-Retimed = Callable[[Timeline], Timeline]
-"""Recorded timing of segments -> changed timing."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import numpy as np
 
 from sim2real.artifacts.identification import Outcome, TriedTerm
 from sim2real.identification import held_out
-from sim2real.identification.fit import Fit, refine, with_terms
+from sim2real.identification.fit import ROUGH, Fit, refine, with_terms
 from sim2real.identification.held_out import Fold, HeldOutPart, Statistics, on_held_out_parts, statistics
 from sim2real.identification.parameters import ParameterTable
 from sim2real.identification.predictions import labels
@@ -220,16 +220,18 @@ class TermSearch:
         self._on_set(", ".join(names) or "no term")
         starts = [with_terms(table, x, present) for x in starts]
         order = np.argsort(np.nan_to_num([problem.loss(x, part) for x in starts], nan=np.inf))
-        ended = refine(problem, starts[order[0]][None], part, coarse=True)
+        ended = refine(problem, starts[order[0]][None], part, gain=ROUGH)
         if len(order) > 1 and ended.loss > (1.0 - _LITTLE) * most:
-            others = refine(problem, np.stack([starts[i] for i in order[1:3]]), part, coarse=True)
+            others = refine(problem, np.stack([starts[i] for i in order[1:3]]), part, gain=ROUGH)
             ended = min(ended, others, key=lambda end: end.loss)
         return self._trial(present, ended.x, ended.loss)
 
     def _judged(self, trial: Trial) -> Trial:
         """Return a trial whose fit ended, with its errors by refits without each part."""
         # To the end, as each refit would have to descend that far, too.
-        further = refine(self._problem, trial.x[None], self._part(trial.present), settle=False)
+        further = refine(
+            self._problem, trial.x[None], self._part(trial.present), gain=self._problem.residuals.precision
+        )
         return replace(self._trial(trial.present, further.x, further.loss, refit=True), present=trial.present)
 
     def _trial(self, present: np.ndarray, x: np.ndarray, loss: float, refit: bool = False) -> Trial:

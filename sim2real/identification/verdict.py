@@ -322,8 +322,6 @@ def way_out(p: Parameter, upper: bool, max_delay_s: float) -> str:
     low, high = p.low, p.high
     if p.transform == "log":
         low, high = (low, high * _WIDER) if upper else (low / _WIDER, high)
-    elif p.transform == "logit":
-        low, high = (low, 1.0 - (1.0 - high) / _WIDER) if upper else (low / _WIDER, high)
     else:
         below = low - (high - low)  # a share or a friction is not negative
         low, high = (low, high + (high - low)) if upper else (max(below, 0.0) if low > 0.0 else below, high)

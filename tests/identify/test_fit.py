@@ -112,7 +112,7 @@ def test_the_first_part_of_a_segment_is_simulated_but_not_compared(episode):
 @pytest.mark.parametrize(
     "wrong",
     [{"skip_s": -0.1}, {"skip_s": float("nan")}, {"difference": 0.0}, {"population": 3}, {"reach": 0.0}, {"seed": -1},
-     {"max_delay_s": 0.0}, {"generations": 0, "refine_steps": 0}],
+     {"max_delay_s": 0.0}, {"refine_steps": 0}],
 )  # fmt: skip
 def test_settings_that_make_no_sense_are_refused(wrong):
     with pytest.raises(UsageError):

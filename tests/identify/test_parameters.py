@@ -1,6 +1,5 @@
 """Parameters: the bijection, per-recording and fixed ones, priors, leaves, and bounds that make no sense."""
 
-import distrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,17 +7,12 @@ import pytest
 from flax import struct
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy import stats
 
 from sim2real.errors import UsageError
 from sim2real.identification.parameters import Parameter, ParameterTable
 
-INVERSE = {
-    "linear": lambda x: x,
-    "log": np.exp,
-    "logit": lambda x: 1.0 / (1.0 + np.exp(-x)),
-}
-FORWARD = {"linear": lambda v: v, "log": np.log, "logit": lambda v: np.log(v / (1.0 - v))}
+INVERSE = {"linear": lambda x: x, "log": np.exp}
+FORWARD = {"linear": lambda v: v, "log": np.log}
 
 
 @st.composite
@@ -26,16 +20,13 @@ def tables(draw):
     """A table with values strictly inside its bounds."""
     parameters, values = [], {}
     for i in range(draw(st.integers(1, 4))):
-        transform = draw(st.sampled_from(["linear", "log", "logit"]))
+        transform = draw(st.sampled_from(["linear", "log"]))
         if transform == "log":
             low = draw(st.floats(1e-4, 1e3))
             high = low * draw(st.floats(1.1, 1e3))
-        elif transform == "linear":
+        else:
             low = draw(st.floats(-100.0, 100.0))
             high = low + draw(st.floats(0.01, 100.0))
-        else:
-            low = draw(st.floats(0.01, 0.5))
-            high = low + draw(st.floats(0.05, 0.49))
         a, b = FORWARD[transform](low), FORWARD[transform](high)
         value = float(INVERSE[transform](a + draw(st.floats(0.01, 0.99)) * (b - a)))
         parameters.append(Parameter(f"p{i}", "1", value, low, high, transform))
@@ -71,7 +62,7 @@ def three():
         [
             Parameter("a", "1", 2.0, 0.5, 8.0),
             Parameter("b", "s", 0.0, -1.0, 3.0, "linear"),
-            Parameter("c", "1", 0.3, 0.1, 0.9, "logit"),
+            Parameter("c", "1", 0.3, 0.1, 0.9),
         ]
     )
 
@@ -79,11 +70,11 @@ def three():
 def test_scales_and_their_slopes_are_what_the_transforms_say(three):
     values = {"a": 1.3, "b": -0.4, "c": 0.7}
     x = three.encode(values)
-    np.testing.assert_allclose(x, [np.log(1.3), -0.4, np.log(0.7 / 0.3)], rtol=1e-9)
+    np.testing.assert_allclose(x, [np.log(1.3), -0.4, np.log(0.7)], rtol=1e-9)
     assert {n: float(v) for n, v in three.decode(x).items()} == pytest.approx(values)
     np.testing.assert_allclose(three.unscale(x), list(values.values()), rtol=1e-9)
     np.testing.assert_allclose(three.slope(x), (three.unscale(x + 1e-6) - three.unscale(x - 1e-6)) / 2e-6, rtol=1e-6)
-    np.testing.assert_allclose(three.span, [np.log(16.0), 4.0, np.log(0.9 / 0.1) - np.log(0.1 / 0.9)])
+    np.testing.assert_allclose(three.span, [np.log(16.0), 4.0, np.log(9.0)])
     many = three.decode(np.stack([x, x + 0.01]), np.array([True, False, True]))
     assert many["b"].tolist() == [0.0, 0.0], "a parameter that is not there has its value without it"
     assert many["a"].shape == (2,)
@@ -93,7 +84,7 @@ def test_points_beyond_the_bounds_are_kept_within(three):
     np.testing.assert_allclose(three.unscale(np.array([99.0, -99.0, 99.0])), [8.0, -1.0, 0.9])
     many = three.unscale(np.zeros((4, 5, 3)))
     assert many.shape == (4, 5, 3)
-    np.testing.assert_allclose(many[2, 3], [1.0, 0.0, 0.5])
+    np.testing.assert_allclose(many[2, 3], [1.0, 0.0, 0.9])
 
 
 def test_delays_start_at_a_quarter_of_their_interval():
@@ -135,47 +126,16 @@ def test_other_nominal_values_are_where_a_search_starts(shared):
     assert other["mass"].nominal == 7.0
 
 
-PRIORS = {
-    "Normal": (distrax.Normal(2.0, 0.5), stats.norm(2.0, 0.5), 2.0),
-    "Gamma": (distrax.Gamma(4.0, 2.0), stats.gamma(4.0, scale=0.5), 1.5),
-    "Laplace": (distrax.Laplace(2.0, 0.4), stats.laplace(2.0, 0.4), 2.0),
-}
+def test_a_prior_is_a_residual_in_its_deviations():
+    table = ParameterTable(
+        [Parameter("free", "1", 1.0, 0.5, 2.0), Parameter("a", "1", 2.0, 0.1, 20.0, prior=(2.0, 0.5))]
+    )
+    assert table.prior_residuals(table.encode({"free": 1.0, "a": 1.25})) == pytest.approx([-1.5])
 
 
-@pytest.mark.parametrize("name", PRIORS)
-@pytest.mark.parametrize("value", [0.6, 1.45, 1.502, 2.0, 2.3, 5.0])
-def test_half_the_squared_residual_is_the_drop_of_the_log_prior(name, value):
-    prior, reference, mode = PRIORS[name]
-    table = ParameterTable([Parameter("free", "1", 1.0, 0.5, 2.0), Parameter("a", "1", 2.0, 0.1, 20.0, prior=prior)])
-    z = jnp.asarray(table.encode({"free": 1.0, "a": value}), jnp.float32)
-    residuals = np.asarray(table.prior_residuals(z))
-    assert residuals.shape == (1,)
-    drop = reference.logpdf(mode) - reference.logpdf(value)
-    assert 0.5 * float(residuals[0] ** 2) == pytest.approx(drop, rel=3e-3, abs=2e-5)
-    if abs(value - mode) > 1e-2:
-        assert np.sign(residuals[0]) == np.sign(value - mode)
-
-
-@pytest.mark.parametrize("name", ["Normal", "Gamma"])
-@pytest.mark.parametrize("off", [0.0, 1e-4, -3e-3])
-def test_a_prior_has_its_curvature_at_its_mode_too(name, off):
-    prior, reference, mode = PRIORS[name]
-    table = ParameterTable([Parameter("a", "1", 2.0, 0.1, 20.0, "linear", prior=prior)])
-    z = table.encode({"a": mode + off})
-    step = 1e-3
-    slope = float((table.prior_residuals(z + step) - table.prior_residuals(z - step))[0]) / (2 * step)
-    h = 1e-3
-    curvature = -(reference.logpdf(mode + h) - 2 * reference.logpdf(mode) + reference.logpdf(mode - h)) / h**2
-    assert slope**2 == pytest.approx(curvature, rel=0.02)
-
-
-@pytest.mark.parametrize(
-    ("prior", "message"),
-    [(3.0, "has no log_prob"), (distrax.Uniform(1.0, 2.0), "no single, finite mode"),
-     (distrax.Gamma(0.5, 1.0), "no single, finite mode")],
-)  # fmt: skip
-def test_priors_that_are_none(prior, message):
-    with pytest.raises(UsageError, match=f"'a'.*{message}"):
+@pytest.mark.parametrize("prior", [(float("nan"), 1.0), (1.0, 0.0), (1.0, float("inf"))])
+def test_priors_that_are_none(prior):
+    with pytest.raises(UsageError, match=r"'a'.*mean and deviation"):
         Parameter("a", "1", 2.0, 1.0, 4.0, prior=prior)
 
 
@@ -214,9 +174,7 @@ def test_values_are_placed_at_their_leaves():
         ((1.0, float("nan"), 1.0), "no interval"),
         ((1.0, 0.5, float("inf")), "no interval"),
         ((1.0, 0.0, 2.0), "positive lower bound"),
-        ((0.5, 0.0, 0.9, "logit"), r"within \(0, 1\)"),
-        ((0.5, 0.1, 1.0, "logit"), r"within \(0, 1\)"),
-        ((0.5, 0.1, 1.0, "cubic"), "unknown transform 'cubic'. Available: linear, log, logit"),
+        ((0.5, 0.1, 1.0, "cubic"), "unknown transform 'cubic'. Available: linear, log"),
     ],
 )
 def test_bounds_that_are_none(arguments, message):

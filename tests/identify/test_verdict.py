@@ -19,7 +19,6 @@ TABLE = ParameterTable(
         Parameter("gain", "1", 2.0, 1.0, 4.0),
         Parameter("offset", "rad", 0.0, -1.0, 1.0, "linear"),
         Parameter("static", "1", 0.1, 0.0, 0.3, "linear"),
-        Parameter("share", "1", 0.5, 0.1, 0.9, "logit"),
         *(Parameter(n, "s", 0.0, 0.0, 0.06, "linear", "delay", side=s)
           for n, s in zip(DELAYS, ("measurement", "command"), strict=True)),
     ]
@@ -124,8 +123,6 @@ def test_a_rough_fit_without_delays_decides_nothing():
         ("gain", "lower", "--bounds gain 0.25 4"),
         ("offset", "upper", "--bounds offset -1 3"),
         ("static", "upper", "--bounds static 0 0.6"),
-        ("share", "upper", "--bounds share 0.1 0.975"),
-        ("share", "lower", "--bounds share 0.025 0.9"),
     ],
 )
 def test_a_bound_comes_with_flags_that_are_accepted(name, side, flags):

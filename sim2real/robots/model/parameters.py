@@ -6,7 +6,6 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import distrax
 import jax.numpy as jnp
 import numpy as np
 
@@ -459,7 +458,7 @@ def _parameter(
         vanishes=quantity.vanishes,
         limits=what in LIMITS,
         term=pattern.term,
-        prior=distrax.Normal(1.0, ALIKE) if quantity.place == "factor" else None,
+        prior=(1.0, ALIKE) if quantity.place == "factor" else None,
         off=absent if pattern.term and (not pattern.free or what in LIMITS) else None,
     )
 

@@ -67,9 +67,7 @@ class JointParameters:
 
     def zeros(self) -> list[Parameter]:
         """Return the encoders' zeros; legs in the air weigh little, so their zeros change a log little."""
-        import distrax
-
-        prior, about = distrax.Normal(0.0, ZERO_RAD), "encoder at the model's zero"
+        prior, about = (0.0, ZERO_RAD), "encoder at the model's zero"
         return [
             Parameter(f"{m}_zero", "rad", 0.0, -0.1, 0.1, "linear", "measurement", about, prior=prior)
             for m in self.motors

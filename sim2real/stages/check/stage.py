@@ -270,7 +270,7 @@ def check(
     config = config_of(config, CheckConfig(record=defaults_of(robot).record))
     robot = in_world(robot, config.world)
     # The squared loss, because a robust loss would hide the errors of the nominal model.
-    fitting = replace(defaults_of(robot).identify, bounds=config.bounds, fix=config.fix, loss="squared")
+    fitting = replace(defaults_of(robot).identify, bounds=config.bounds, fix=config.fix, reach=np.inf)
     model = robot.identifiable(fitting.max_delay_s)
     parameters = model.parameters.with_bounds(config.bounds).with_fixed(config.fix)
     # Open the recordings, or simulate the planned one.

@@ -47,7 +47,7 @@ def tested(
     posterior = identification.needed_posterior()
     # Test each parameter, and fit all of them to this log.
     drifted, x = drift_test.drift(problem, posterior, identification.widening or 1.0, robot.causes)
-    z = refine(problem, problem.table.within(x)[None], settle=False).x
+    z = refine(problem, problem.table.within(x)[None], gain=problem.residuals.precision).x
     refitted = {n: float(np.ravel(v)[0]) for n, v in problem.table.decode(z).items()}
     nominal = {p.name: p.nominal for p in problem.model.parameters}
     # Predict the segments with each model.

@@ -72,7 +72,7 @@ def fit_model(inputs: Inputs, best: Best) -> Fits:
     config, auto = inputs.config, inputs.config.terms == "auto"
     base = with_terms(inputs, "none") if auto else inputs
     # Terms are compared on windows, which takes less time; long segments follow.
-    longer = bool(long_spans(inputs.episodes, inputs.fitted, config)) and config.refine_steps > 0
+    longer = bool(long_spans(inputs.episodes, inputs.fitted, config))
     windows = replace(base, config=replace(config, long_s=0.0)) if longer else base
     whole = _fitted(windows, best, "identify")
     own, values, tried, added = whole.problem.table.terms, whole.values, (), ""

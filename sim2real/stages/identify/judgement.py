@@ -27,7 +27,7 @@ from sim2real.identification import predictions as prediction
 from sim2real.identification import verdict
 from sim2real.identification.delays import links
 from sim2real.identification.expected import wider_for, with_expected_errors
-from sim2real.identification.fit import Fit, as_numbers, refine, refit
+from sim2real.identification.fit import ROUGH, Fit, as_numbers, refine, refit
 from sim2real.identification.held_out import HeldOutPart
 from sim2real.identification.predictions import Position, positions, replays, ringing, worst_second
 from sim2real.identification.problem import Problem, few_of
@@ -399,8 +399,8 @@ def inclined(inputs: Inputs, fit: Fit) -> tuple[float, dict[str, float], str] | 
             starts.append(candidates[int(np.argmin(losses))])
     if not starts:
         return None
-    before = refine(problem, estimate[None], problem.part(present=~columns), coarse=True)
-    after = refine(problem, np.stack(starts), coarse=True)
+    before = refine(problem, estimate[None], problem.part(present=~columns), gain=ROUGH)
+    after = refine(problem, np.stack(starts), gain=ROUGH)
     if not after.loss < MENDS**2 * before.loss:
         return None
     values = as_numbers(problem.table, after.x)
