@@ -39,7 +39,7 @@ def test_the_viewer_gets_every_signal_lateness_and_the_robot(tmp_path, pipeline)
     for chunk in RrdReader(file).stream().to_chunks():
         rows[chunk.entity_path.replace("\\", "")] += 0 if chunk.is_static else chunk.num_rows
         first |= set(chunk.timeline_names)
-    field, moving = {"pendulum": ("th", "turning"), "so101": ("position[3]", "body_4")}[pipeline]
+    field, moving = {"pendulum": ("th", "body_1"), "so101": ("position[3]", "body_4")}[pipeline]
     command = {"pendulum": "action", "so101": "goal[5]"}[pipeline]
     steps = len(log.steps["sensor"])
     assert rows[f"/record/session/sensor/{field}"] == steps
