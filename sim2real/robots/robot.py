@@ -134,6 +134,7 @@ class RobotDrive(ABC):
         message: Makes the actuator's message from a command ``(actions,)``.
         expected_delay_s: Computation delays of sensor, agent and actuator that phases allow for: a bus transaction, and
             a policy with its thread's wake-up [s].
+        centre: Commands around which an excitation moves, ``(actions,)``.
         probe: The steps by which deploy measures the delay; None: the delay is not measured.
         zero_rad: Reading of the emulated encoders, from count 0, at the device's 0 [rad].
     """
@@ -143,6 +144,7 @@ class RobotDrive(ABC):
     units: Mapping[str, str]
     message: Callable[[PyTree], PyTree]
     expected_delay_s: tuple[float, float, float] = (0.002, 0.002, 0.002)
+    centre: np.ndarray | float = 0.0
     probe: Probe | None = None
     zero_rad: float = 0.0
 
@@ -223,10 +225,6 @@ class RobotDrive(ABC):
         """
         return limits.gate(limits.limit)
 
-    def around(self, signal: np.ndarray) -> np.ndarray:
-        """Return the commands ``(N, actions)`` of an excitation; default: the signal itself, around 0."""
-        return signal
-
     def standing(self, duration_s: float) -> np.ndarray | None:
         """Return the excitation ``(N, actions)`` of a robot on its feet; None: it has no feet."""
         return None
@@ -235,7 +233,7 @@ class RobotDrive(ABC):
         """Return the commands ``(N, actions)`` with a way to the first of them, from where the robot is; default: none.
 
         Args:
-            commands: Result of ``around``.
+            commands: Those of the excitation.
         """
         return commands
 
@@ -534,7 +532,7 @@ class Robot(RecordedRobot):
         if signal is None:
             return {SENSOR: self._sensor(rig)}
         drive = self.drive
-        rows = drive.around(np.asarray(signal, np.float64).reshape(-1, len(self.agent.action)))
+        rows = np.asarray(signal, np.float64).reshape(-1, len(self.agent.action)) + drive.centre
         rows = rows if standing else drive.approach(rig, rows)
         player = Excitation(AGENT, self.rate_hz, rows, drive.message, delay=drive.expected_delay_s[1])
         return self._on_hardware(rig, player, (lambda: drive.begin(rig)) if standing else None)

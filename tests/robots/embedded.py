@@ -144,7 +144,7 @@ class Go2(Arm):
         robot = load_robot("go2")
         self.name, self.drive, self.id = "go2", robot.drive, self.faulty
         self.limits, self.joints = replace(robot.defaults.deploy.gate, first_step_rad=np.inf), robot.drive._joints
-        self.stance = robot.drive._stance
+        self.stance = robot.drive.centre
 
     def robot(self, seed, plant=None, **faults):
         from pipelines.go2.plant import Go2Body

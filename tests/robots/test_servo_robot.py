@@ -103,4 +103,4 @@ def test_an_excitation_is_around_the_middle_and_waits_where_it_ends():
     played = np.array([agent.step(SimpleNamespace(seq=k))[1].goal for k in range(60)])
     np.testing.assert_allclose(played[:40], signal + np.array([0.3, -0.2]))
     np.testing.assert_allclose(played[40:], np.tile(played[39], (20, 1)))
-    np.testing.assert_allclose(robot.drive.around(signal), signal + np.array([0.3, -0.2]))
+    np.testing.assert_allclose(robot.drive.centre, [0.3, -0.2])

@@ -177,7 +177,7 @@ def test_logs_that_are_not_of_a_robot_on_its_feet_are_refused(tmp_path, standing
 
 
 def test_the_legs_bend_slowly_towards_the_folded_ones():
-    goals = ROBOT.drive.around(ROBOT.drive.standing(10.0))
+    goals = ROBOT.drive.standing(10.0) + ROBOT.drive.centre
     assert len(goals) == 500
     np.testing.assert_allclose(goals[0], ROBOT.stance, atol=1e-6)
     share = (goals - ROBOT.stance) / (np.asarray(ROBOT.motors.folded) - ROBOT.stance)

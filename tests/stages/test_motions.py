@@ -37,7 +37,7 @@ def write(path, pose, order=range(6), unit="deg"):
 def goals(path, **settings):
     config = replace(ARM.defaults.record, excitation=str(path), **settings)
     robot = ARM
-    return robot.drive.around(played(config, robot, announce=True))
+    return played(config, robot, announce=True) + robot.drive.centre
 
 
 def at_the_robots_rate(pose):

@@ -168,7 +168,7 @@ def record(path: Path, arm: HiddenArm, robot: Any, seconds: float) -> None:
 
     config = replace(robot.defaults.record, duration_s=seconds, seed=arm.seed)
     signal = excitation(config, robot.rate_hz, len(robot.agent.action))
-    goals = approached(robot.drive.around(signal), robot.drive.servos.at_rest, robot.rate_hz)
+    goals = approached(signal + robot.drive.centre, robot.drive.servos.at_rest, robot.rate_hz)
     played = play(replace(arm, load_kg=0.0), robot, lambda reading, k: goals[k], len(goals) / RATE_HZ, 0)
     commands = [Goals(row.astype(np.float32)) for row in played.goals]
     write_log(path, robot.name, played.times, played.readings, commands, {**robot.units})

@@ -49,14 +49,14 @@ def record(
     legs = EmulatedLegs(body, config, truth)
     # Let the legs hang, then plan the way to the excitation from there; or let the robot stand up.
     if standing:
-        begin_ns, goals = _stand_up(legs, robot), robot.drive.around(robot.drive.standing(seconds))
+        begin_ns, goals = _stand_up(legs, robot), robot.drive.standing(seconds) + robot.drive.centre
     else:
         begin_ns = round(1e9 * HANG_S)
         legs.advance(begin_ns)
         config_of = replace(pipeline.defaults.record, duration_s=seconds, seed=seed)
         hanging = legs.state(begin_ns).record["motor_state"]["q"][:12]
         signal = excitation(config_of, robot.rate_hz, len(robot.joints))
-        goals = approached(robot.drive.around(signal), hanging, robot.rate_hz)
+        goals = approached(signal + robot.drive.centre, hanging, robot.rate_hz)
     _play(path, legs, robot, goals, begin_ns, seed)
     truth.close()
 

@@ -198,6 +198,7 @@ class ServoDrive(RobotDrive):
     ) -> None:
         self.servos, self.rate_hz, self.probe = servos, rate_hz, probe
         self._embedded, self._settings = embedded, settings
+        self.centre = np.asarray(servos.middle or 0.0)
 
     @property
     def mounting(self) -> tuple[Joint, ...]:
@@ -225,9 +226,6 @@ class ServoDrive(RobotDrive):
             SafetyStop: The robot rests at another position, or the gate stopped it.
         """
         bring_home(rig, self.servos, self.rate_hz, settle_s)
-
-    def around(self, signal: np.ndarray) -> np.ndarray:
-        return signal + np.asarray(self.servos.middle or 0.0)
 
     def approach(self, rig: Rig, commands: np.ndarray) -> np.ndarray:
         return approached(commands, rig.measure().position_rad, self.rate_hz)

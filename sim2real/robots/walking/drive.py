@@ -192,6 +192,7 @@ class WalkingDrive(RobotDrive):
         motors: The motors; None: the robot has no device, and its policy walks on the twin alone.
     """
 
+    centre: np.ndarray
     command = "q"
     units = MappingProxyType({"q": "rad", "dq": "rad/s", "kp": "N m/rad", "kd": "N m s/rad", "tau": "N m"})
     expected_delay_s = (0.002, 0.003, 0.002)
@@ -206,7 +207,7 @@ class WalkingDrive(RobotDrive):
         motors: LegMotors | None = None,
         stand_up: StandUp | None = None,
     ) -> None:
-        self._mjcf, self._joints, self._stance, self.rate_hz = mjcf, tuple(joints), np.asarray(stance), rate_hz
+        self._mjcf, self._joints, self.centre, self.rate_hz = mjcf, tuple(joints), np.asarray(stance), rate_hz
         self._motors, self._stand_up = motors, stand_up or StandUp()
         self.message: Callable[[Any], LegCommand] = partial(leg_command, kp=gains[0], kd=gains[1])
 
@@ -229,14 +230,11 @@ class WalkingDrive(RobotDrive):
     def prepare(self, rig: Rig, settle_s: float) -> None:
         rig.wait_until_still(settle_s, _STILL_RAD_S)
 
-    def around(self, signal: np.ndarray) -> np.ndarray:
-        return signal + self._stance
-
     def standing(self, duration_s: float) -> np.ndarray:
         t_s = np.arange(0.0, duration_s, 1.0 / self.rate_hz)
         bent = 0.5 * _BENT * (1.0 - np.cos(2.0 * np.pi * _BEND_HZ * t_s))
-        folded = self._stance if self._motors is None else np.asarray(self._motors.folded)
-        return bent[:, None] * (folded - self._stance)
+        folded = self.centre if self._motors is None else np.asarray(self._motors.folded)
+        return bent[:, None] * (folded - self.centre)
 
     def approach(self, rig: Rig, commands: np.ndarray) -> np.ndarray:
         hanging = rig.wait_until_still(_HANG_S, _STILL_RAD_S)
@@ -259,11 +257,11 @@ class WalkingDrive(RobotDrive):
             reading = rig.measure()
             if gravity_of(reading.parts["quaternion"])[2] > -0.5:
                 raise SafetyStop("the robot tipped over while it stood up", hint="lay it on even ground, legs folded")
-            command = leg_command(motion.targets(t_s, start, folded, self._stance), motion.kp, motion.kd)
+            command = leg_command(motion.targets(t_s, start, folded, self.centre), motion.kp, motion.kd)
             table = np.stack([getattr(command, column.name) for column in rig.device.commanded.columns], axis=-1)
             # The gate's time ends at 0, where that of the graph starts.
             rig.command(table, 0.0, t_s - motion.duration_s)
-        off = np.abs(reading.position_rad - self._stance)
+        off = np.abs(reading.position_rad - self.centre)
         if off.max() > 0.5:
             worst = int(off.argmax())
             raise SafetyStop(f"{self._joints[worst]} is {off[worst]:.2g} rad off the stance after standing up")

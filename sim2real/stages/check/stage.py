@@ -354,7 +354,7 @@ def _planned(
         raise NotInstalled("a plan is simulated with JAX, which is not installed here", hint="name a log with --log")
     from sim2real.stages.session.simulated_log import simulate  # JAX programs
 
-    signal = robot.drive.around(played(config.record, robot))
+    signal = played(config.record, robot) + robot.drive.centre
     values = parameters.decode(parameters.start())
     return simulate(model, robot, signal, values, fitting, config.record.seed)
 

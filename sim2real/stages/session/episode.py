@@ -3,6 +3,7 @@
 import math
 import select
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -282,10 +283,11 @@ def come_to_rest(graph: AsyncGraph, rig: Rig, hold: bool) -> None:
 
 
 def _told() -> bool:
-    """Return whether Enter was pressed."""
+    """Wait a moment, and return whether Enter was pressed; an emulated robot must not run ahead of a person."""
     if not sys.stdin.isatty():  # an input that is closed would let go at once
+        time.sleep(_REST_POLL_S)
         return False
-    ready = bool(select.select([sys.stdin], [], [], 0.0)[0])
+    ready = bool(select.select([sys.stdin], [], [], _REST_POLL_S)[0])
     return ready and bool(sys.stdin.readline())
 
 

@@ -26,7 +26,7 @@ _LEAST_S = 1.0
 
 
 def played(config: RecordConfig, robot: Robot, announce: bool = False) -> np.ndarray:
-    """Return the signal ``(N, commands)`` that ``RobotDrive.around`` makes commands of, one row a step.
+    """Return the signal ``(N, commands)`` around ``RobotDrive.centre``, one row a step.
 
     Args:
         announce: Whether it prints which signals of a file are played, and for how long.
@@ -54,7 +54,7 @@ def played(config: RecordConfig, robot: Robot, announce: bool = False) -> np.nda
         note(f"motion: {source}, {len(rows) / robot.rate_hz:.1f} s")
         if skipped_s > 2.0 / robot.rate_hz:
             note(f"motion: {skipped_s:.1f} s at its ends are outside of the limits, and are not played")
-    return rows - robot.drive.around(np.zeros((1, commands)))
+    return rows - robot.drive.centre
 
 
 # -- a motion from a file

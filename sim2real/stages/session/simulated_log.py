@@ -33,7 +33,7 @@ def simulate(
 
     Args:
         robot: Its command is excited, at its rate.
-        signal: Shape ``(N, actions)``: one command a step, as ``RobotDrive.around`` returns them.
+        signal: Shape ``(N, actions)``: one command a step.
         config: Largest delay of the model, and the engine.
     """
     # Draw a timeline, and play the signal on it.
