@@ -60,7 +60,7 @@ def test_mappings_of_recorders(tmp_path_factory, texts, number):
     """import.toml: names of nodes, fields and signals, and lines of comment, may be anything; a unit is printable."""
     path = tmp_path_factory.mktemp("mapping") / "import.toml"
     unit = texts[4] if texts[4].isprintable() else ""
-    field = FieldMapping(tuple(texts[:2]), unit, scale=(number, 2.0), offset=number, shape=(2,))
+    field = FieldMapping(tuple(texts[:2]), unit, scale=(number, 2.0), offset=number)
     nodes = {texts[2]: NodeMapping({texts[3]: field, "other": FieldMapping((texts[0],))}, stamps=texts[5])}
     path.write_text(to_toml(ImportMapping(texts[0], nodes), comments=texts), encoding="utf-8")
     assert load_mapping(path) == ImportMapping(texts[0], nodes, path)

@@ -16,7 +16,7 @@ STAMPS_US = 3501 + 20_000 * np.arange(COUNT) + np.arange(COUNT) ** 2 % 7
 MAPPING = {
     "pipeline": "rig",
     "nodes": {
-        "actuator": {"stamps": "t", "fields": {"action": {"source": "u", "unit": "V", "shape": [1]}}},
+        "actuator": {"stamps": "t", "fields": {"action": {"source": ["u"], "unit": "V"}}},
         "sensor": {
             "stamps": "t",
             "fields": {
@@ -30,7 +30,7 @@ TOML = """
 pipeline = "rig"
 [nodes.actuator]
 rate_hz = 40.0
-fields.action = { source = "u", unit = "V", shape = [1] }
+fields.action = { source = ["u"], unit = "V" }
 [nodes.sensor]
 stamps = "t"
 fields.th = { source = "q[:,0]", unit = "rad" }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -36,7 +37,7 @@ class _Stream:
     """The samples of one node, before and after a selection.
 
     Attributes:
-        fields: Field -> values in the log's unit, shape ``(N, ...)``, or ``()`` for a constant.
+        fields: Field -> values in the log's unit, shape ``(N, ...)``.
         stamps: Shape ``(N,)``, as recorded; None without any.
         rows: The numbers of the selected samples in the file.
         turning: Fields with angles that jumped at the end of a turn.
@@ -93,8 +94,7 @@ def import_table(table: Table, mapping: ImportMapping, samples: slice | None = N
         _select(table, name, node, streams[name])
         ticks[name] = _ticks(table, name, node, streams[name])
     outputs = {
-        name: {f: _samples(table, name, f, how, streams[name]) for f, how in node.fields.items()}
-        for name, node in mapping.nodes.items()
+        name: {f: _samples(table, name, f, streams[name]) for f in node.fields} for name, node in mapping.nodes.items()
     }
     _align_turns(mapping, streams, outputs, ticks)
     # Move time 0 to the file's zero or the first sample.
@@ -194,6 +194,7 @@ def _stream(table: Table, name: str, node: NodeMapping) -> _Stream:
     """Read a node's signals, all of the same length."""
     turning: set[str] = set()
     fields = {field: _field(table, name, field, how, turning) for field, how in node.fields.items()}
+    constant = {f for f, how in node.fields.items() if all(not table.signal(s).ndim for s in how.sources)}
     stamps = None if node.stamps is None else table.signal(node.stamps)
     if stamps is not None and stamps.ndim != 1:
         raise UsageError(
@@ -201,7 +202,7 @@ def _stream(table: Table, name: str, node: NodeMapping) -> _Stream:
             hint=f'choose a column, such as stamps = "{node.stamps}[:,0]"',
         )
     # All signals of a node need one length.
-    lengths = {field: len(values) for field, values in fields.items() if values.ndim}
+    lengths = {field: len(values) for field, values in fields.items() if field not in constant}
     if stamps is not None:
         lengths[f"stamps {node.stamps!r}"] = len(stamps)
     listed = ", ".join(f"{signal} {length}" for signal, length in lengths.items())
@@ -215,11 +216,12 @@ def _stream(table: Table, name: str, node: NodeMapping) -> _Stream:
     count = next(iter(lengths.values()))
     if not count:
         raise UsageError(f"node {name!r} has no samples in {table.path}", hint="check that the file is complete")
+    fields |= {field: np.broadcast_to(fields[field], (count, *fields[field].shape)) for field in constant}
     return _Stream(fields, stamps, np.arange(count), turning, Counter())
 
 
 def _field(table: Table, node: str, field: str, how: FieldMapping, turning: set[str]) -> np.ndarray:
-    """Return a field's values in the log's unit; several sources are stacked along the last axis.
+    """Return a field's values in the log's unit, shape ``(N, ...)``; of constants without the first axis.
 
     Args:
         turning: Gets the field if turns were counted.
@@ -228,7 +230,7 @@ def _field(table: Table, node: str, field: str, how: FieldMapping, turning: set[
     factor, unit = in_si(how.unit)
     for source, part in zip(how.sources, parts, strict=True):
         # Jumps by 2^16 or 2^32 are counts that were read with the wrong sign, unless they are a turn.
-        for column in part.reshape(len(part), -1).T if part.ndim and unit == "rad" else ():
+        for column in part.reshape(len(part), -1).T if part.ndim and part.size and unit == "rad" else ():
             modulus = checks.unsigned(column)
             turns = factor * np.abs(np.asarray(how.scale)) * (modulus or 0) / checks.TURN_RAD
             if modulus is not None and not np.isclose(turns, 1.0, atol=0.01).any():
@@ -237,25 +239,32 @@ def _field(table: Table, node: str, field: str, how: FieldMapping, turning: set[
                     f"beyond {modulus.bit_length() - 1} bits",
                     hint="decode them as signed (two's complement, or a sign bit) before the import",
                 )
-    try:
-        raw = parts[0] if isinstance(how.source, str) else np.stack(np.broadcast_arrays(*parts), axis=-1)
-    except ValueError:
-        shapes = ", ".join(f"{source} {part.shape}" for source, part in zip(how.sources, parts, strict=True))
-        raise UsageError(
-            f"the sources of field {node}.{field} differ in shape: {shapes}", hint="stack signals of one length"
-        ) from None
+    raw = parts[0]
+    if not isinstance(how.source, str):
+        # The columns of all sources; a constant beside series is one in every row.
+        lengths = {len(part) for part in parts if part.ndim}
+        if len(lengths) > 1:
+            shapes = ", ".join(f"{source} {part.shape}" for source, part in zip(how.sources, parts, strict=True))
+            raise UsageError(
+                f"the sources of field {node}.{field} differ in length: {shapes}", hint="name signals of one length"
+            )
+        rows = max(lengths, default=1)
+        columns = [p.reshape(rows, math.prod(p.shape[1:])) if p.ndim else np.full((rows, 1), p) for p in parts]
+        raw = np.concatenate(columns, axis=1)[slice(None) if lengths else 0]
+    is_series = any(part.ndim for part in parts)
     values = raw.astype(np.float64)
     scale, offset = (np.squeeze(x) if np.size(x) == 1 else np.asarray(x) for x in (how.scale, how.offset))
     for key, numbers in (("scale", scale), ("offset", offset)):
-        if numbers.ndim and numbers.shape != values.shape[values.ndim > 0 :]:
+        if numbers.ndim and numbers.shape != values.shape[is_series:]:
             raise UsageError(
-                f"field {node}.{field} has {numbers.size} values of {key} for samples of shape {values.shape[1:]}",
+                f"field {node}.{field} has {numbers.size} values of {key} for samples of shape "
+                f"{values.shape[is_series:]}",
                 hint="give one number, or one for each column",
             )
     scaled = scale * values + offset
     scaled = scaled if factor == 1.0 else factor * scaled
     # A robot with hinges and slides has no unit. Count over all samples: a part of a file has the turns of the whole.
-    if scaled.ndim and (unit == "rad" or (not unit and field in ("position", "goal"))):
+    if is_series and scaled.size and (unit == "rad" or (not unit and field in ("position", "goal"))):
         counted = checks.counted(scaled.reshape(len(scaled), -1), checks.TURN_RAD).reshape(scaled.shape)
         if not np.array_equal(counted, scaled, equal_nan=True):
             turning.add(field)
@@ -290,7 +299,7 @@ def _cut(table: Table, streams: Mapping[str, _Stream], samples: slice | None) ->
 
 def _select(table: Table, name: str, node: NodeMapping, own: _Stream) -> None:
     """Leave out samples that lack a number, repeat a stamp or leap; refuse positions that no joint can have."""
-    whole = {field: _finite(v)[own.rows] for field, v in own.fields.items() if v.ndim}
+    whole = {field: _finite(v)[own.rows] for field, v in own.fields.items()}
     everywhere = np.ones(len(own.rows), bool)
     good = np.logical_and.reduce([everywhere, *whole.values()])
     # Two streams in one table lack numbers in turn. A gain that is written rarely would cost most of the goals.
@@ -326,7 +335,7 @@ def _keep_plausible(table: Table, name: str, field: str, node: NodeMapping, own:
     t_s = own.rows / (node.rate_hz or 1.0)
     if own.stamps is not None:
         t_s = own.stamps[own.rows] * (STAMP_UNITS[node.stamp_unit] * 1e-9)
-    if not values.ndim or len(own.rows) < 3 or not (np.isfinite(t_s).all() and (np.diff(t_s) > 0).all()):
+    if len(own.rows) < 3 or not (np.isfinite(t_s).all() and (np.diff(t_s) > 0).all()):
         return  # the check of stamps raises the better error
     angle = values[own.rows].reshape(len(own.rows), -1).astype(np.float64)
     good = np.asarray(~checks.glitches(t_s, angle).any(axis=1))
@@ -341,22 +350,14 @@ def _keep_plausible(table: Table, name: str, field: str, node: NodeMapping, own:
     own.keep(good, "leap away and back")
 
 
-def _samples(table: Table, name: str, field: str, how: FieldMapping, own: _Stream) -> np.ndarray:
-    """Return the selected samples of a field, shape ``(N, ...)``; a constant is repeated."""
-    values = own.fields[field]
-    values = values[own.rows] if values.ndim else np.broadcast_to(values, own.rows.shape)
+def _samples(table: Table, name: str, field: str, own: _Stream) -> np.ndarray:
+    """Return the selected samples of a field, shape ``(N, ...)``."""
+    values = own.fields[field][own.rows]
     if not values.size or not np.isfinite(values).all():
         raise UsageError(
             f"field {name}.{field} has no finite number in {table.path}", hint="check the file, or remove the field"
         )
-    shape = values.shape[1:] if how.shape is None else how.shape
-    if shape != (-1,) and np.prod(shape, dtype=int) != np.prod(values.shape[1:], dtype=int):
-        raise UsageError(
-            f"a sample of field {name}.{field} has the shape {values.shape[1:]} in {table.path}, and {shape} in the "
-            "mapping",
-            hint="correct the shape, or choose columns of the source",
-        )
-    return np.ascontiguousarray(values.reshape(len(values), *shape))
+    return np.ascontiguousarray(values)
 
 
 def _ticks(table: Table, name: str, node: NodeMapping, own: _Stream) -> np.ndarray:

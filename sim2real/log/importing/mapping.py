@@ -47,18 +47,17 @@ class FieldMapping(_Table, frozen=True):
     """The source of a field of a node's output.
 
     Attributes:
-        source: Name of a signal in the file, or a list of names for a vector; ``q[:,0]`` is a column of an array.
+        source: Name of a signal in the file, or a list of names, also of one, whose columns make a vector; ``q[:,0]``
+            is a column of an array.
         unit: Unit of the field after scaling; degrees, turns and counts are converted to radians, mm to m.
         scale: The field is ``scale * signal + offset``; one number, or one for each column.
         offset: See ``scale`` [the field's unit]; one number, or one for each column.
-        shape: Shape of one sample; None: as in the file; ``(-1,)``: a vector, of a number one of length 1.
     """
 
     source: str | tuple[str, ...]
     unit: str = ""
     scale: float | tuple[float, ...] = 1.0
     offset: float | tuple[float, ...] = 0.0
-    shape: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
         if not self.sources or not all(self.sources):
@@ -68,8 +67,6 @@ class FieldMapping(_Table, frozen=True):
             numbers = value if isinstance(value, tuple) else (value,)
             if not numbers or not all(map(math.isfinite, numbers)):
                 raise ValueError(f"{key} must be a finite number, or a list of them, got {value}")
-        if self.shape not in (None, (-1,)) and not all(n > 0 for n in self.shape or ()):
-            raise ValueError(f"shape must be whole numbers above 0, or [-1] for a vector, got {list(self.shape or ())}")
         if not self.unit.isprintable():
             raise ValueError(f"a unit stands on one line, got {self.unit!r}")
 

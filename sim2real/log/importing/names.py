@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -248,9 +248,9 @@ class Signal:
         sources, labels = (tuple(part[i] for i in places) for part in (self.sources, self.labels))
         return Signal(sources, labels, self.meaning, self.values[..., list(places)], whole)
 
-    def mapped(self, unit: str, **more: Any) -> FieldMapping:
+    def mapped(self, unit: str) -> FieldMapping:
         """Return the field that has these columns."""
-        return FieldMapping(self.whole or self.sources, unit, **more)
+        return FieldMapping(self.whole or self.sources, unit)
 
 
 def collect(table: Table) -> tuple[list[Signal], list[str]]:

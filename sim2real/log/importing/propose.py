@@ -363,7 +363,7 @@ class Proposal:
             )
         if self.hints.calibration is not None and unit in lerobot.UNITS:
             scale, offset = lerobot.conversion(self.hints.calibration, signal.labels, unit)
-            return signal.mapped("rad", scale=tuple(scale), offset=tuple(offset))
+            return msgspec.structs.replace(signal.mapped("rad"), scale=tuple(scale), offset=tuple(offset))
         return signal.mapped(unit)
 
     def in_lengths(self, fields: Mapping[str, FieldMapping]) -> dict[str, FieldMapping]:
@@ -402,9 +402,7 @@ class Proposal:
             if not np.nan_to_num(chosen.values).any() and not name.startswith("payload"):
                 self.evidence.append(f"{chosen.name!r} is 0 throughout: omitted")
                 continue
-            is_constant = chosen.values.ndim == 1
-            source = chosen.sources[0] if is_constant and chosen.width == 1 else chosen.whole or chosen.sources
-            fields["actuator"][name] = FieldMapping(source, unit, shape=(-1,) if is_constant else None)
+            fields["actuator"][name] = chosen.mapped(unit)
             self.reasons["actuator", name, "source"] = "by its name"
 
     def add_velocities(

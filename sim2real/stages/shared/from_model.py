@@ -93,7 +93,7 @@ def _of_joints(mapping: ImportMapping) -> ImportMapping:
     """Return a mapping with a vector for each field, as joints have it."""
     replaced = msgspec.structs.replace
     nodes = {
-        name: replaced(n, fields={k: replaced(f, shape=f.shape or (-1,)) for k, f in n.fields.items()})
+        name: replaced(n, fields={k: replaced(f, source=f.sources) for k, f in n.fields.items()})
         for name, n in mapping.nodes.items()
     }
     return replaced(mapping, nodes=nodes)
@@ -153,7 +153,7 @@ def _description(flags: RobotFlags, model: MjModel, episode: Episode) -> RobotCo
         raise UsageError(
             f"a sample of each field has the shape {n}, for {', '.join(joints)}, but in the log: {', '.join(wrong)}",
             hint="name the joints that were recorded with --joints, in the order of the columns; in the mapping of an "
-            "import, shape = [-1] makes a vector of a number",
+            "import, a list of one source makes a vector of a number",
         )
     # Rate and step follow from the log and the model.
     fastest = min(float(np.quantile(np.diff(episode.steps[n].begun_s), _FASTEST)) for n in ("actuator", "sensor"))
