@@ -235,7 +235,7 @@ def spoilt(values, index, value):
     [
         ({"u": None}, ["no 'u'", "Available: t, q, kp"]),
         ({"q": None, "q_": Q}, ["did you mean q_?"]),
-        ({"u": U[:-1]}, ["node 'actuator'", "action 49", "stamps 't' 50"]),
+        ({"u": U[:-1]}, ["node 'actuator'", "u 49", "stamps 't' 50"]),
         ({"t": spoilt(STAMPS_US / 1e6, 17, 0.3)}, ["do not increase", "sample 16 at", "sample 17 at 0.3 s"]),
         ({"t": STAMPS_US / 1e15}, ["do not increase", "sample 0 at", "stamp_unit is 's'"]),
         ({"t": STAMPS_US * 1e12}, ["centuries away", "stamp_unit is 's'"]),

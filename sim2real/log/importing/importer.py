@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -191,22 +190,18 @@ def facts(episode: Episode) -> dict[str, Json]:
 
 
 def _stream(table: Table, name: str, node: NodeMapping) -> _Stream:
-    """Read a node's signals, all of the same length."""
-    turning: set[str] = set()
-    fields = {field: _field(table, name, field, how, turning) for field, how in node.fields.items()}
-    constant = {f for f, how in node.fields.items() if all(not table.signal(s).ndim for s in how.sources)}
+    """Read a node's signals, all of the same length; constants are the same in every sample."""
     stamps = None if node.stamps is None else table.signal(node.stamps)
     if stamps is not None and stamps.ndim != 1:
         raise UsageError(
             f"stamps {node.stamps!r} in {table.path} have the shape {stamps.shape}, expected (N,)",
             hint=f'choose a column, such as stamps = "{node.stamps}[:,0]"',
         )
-    # All signals of a node need one length.
-    lengths = {field: len(values) for field, values in fields.items() if field not in constant}
-    if stamps is not None:
-        lengths[f"stamps {node.stamps!r}"] = len(stamps)
-    listed = ", ".join(f"{signal} {length}" for signal, length in lengths.items())
+    signals = {source: table.signal(source) for how in node.fields.values() for source in how.sources}
+    lengths = {source: len(values) for source, values in signals.items() if values.ndim}
+    lengths |= {f"stamps {node.stamps!r}": len(stamps)} if stamps is not None else {}
     if len(set(lengths.values())) != 1:
+        listed = ", ".join(f"{signal} {length}" for signal, length in lengths.items())
         raise UsageError(
             f"the signals of node {name!r} differ in length: {listed}"
             if lengths
@@ -216,21 +211,26 @@ def _stream(table: Table, name: str, node: NodeMapping) -> _Stream:
     count = next(iter(lengths.values()))
     if not count:
         raise UsageError(f"node {name!r} has no samples in {table.path}", hint="check that the file is complete")
-    fields |= {field: np.broadcast_to(fields[field], (count, *fields[field].shape)) for field in constant}
-    return _Stream(fields, stamps, np.arange(count), turning, Counter())
+    series = {source: values if values.ndim else np.full(count, values) for source, values in signals.items()}
+    stream = _Stream({}, stamps, np.arange(count), set(), Counter())
+    for field, how in node.fields.items():
+        stream.fields[field] = _field(table, f"{name}.{field}", how, [series[s] for s in how.sources])
+        # A robot with hinges and slides has no unit. Count over all samples, so that a part has the turns of the whole.
+        if how.log_unit == "rad" or (not how.unit and field in ("position", "goal")):
+            scaled = stream.fields[field]
+            counted = checks.counted(scaled.reshape(count, -1), checks.TURN_RAD).reshape(scaled.shape)
+            if not np.array_equal(counted, scaled, equal_nan=True):
+                stream.fields[field] = counted
+                stream.turning.add(field)
+    return stream
 
 
-def _field(table: Table, node: str, field: str, how: FieldMapping, turning: set[str]) -> np.ndarray:
-    """Return a field's values in the log's unit, shape ``(N, ...)``; of constants without the first axis.
-
-    Args:
-        turning: Gets the field if turns were counted.
-    """
-    parts = [table.signal(source) for source in how.sources]
+def _field(table: Table, name: str, how: FieldMapping, parts: Sequence[np.ndarray]) -> np.ndarray:
+    """Return a field's values in the log's unit, shape ``(N, ...)``; a list of sources has the columns of all."""
     factor, unit = in_si(how.unit)
     for source, part in zip(how.sources, parts, strict=True):
         # Jumps by 2^16 or 2^32 are counts that were read with the wrong sign, unless they are a turn.
-        for column in part.reshape(len(part), -1).T if part.ndim and part.size and unit == "rad" else ():
+        for column in part.reshape(len(part), -1).T if unit == "rad" else ():
             modulus = checks.unsigned(column)
             turns = factor * np.abs(np.asarray(how.scale)) * (modulus or 0) / checks.TURN_RAD
             if modulus is not None and not np.isclose(turns, 1.0, atol=0.01).any():
@@ -241,35 +241,16 @@ def _field(table: Table, node: str, field: str, how: FieldMapping, turning: set[
                 )
     raw = parts[0]
     if not isinstance(how.source, str):
-        # The columns of all sources; a constant beside series is one in every row.
-        lengths = {len(part) for part in parts if part.ndim}
-        if len(lengths) > 1:
-            shapes = ", ".join(f"{source} {part.shape}" for source, part in zip(how.sources, parts, strict=True))
-            raise UsageError(
-                f"the sources of field {node}.{field} differ in length: {shapes}", hint="name signals of one length"
-            )
-        rows = max(lengths, default=1)
-        columns = [p.reshape(rows, math.prod(p.shape[1:])) if p.ndim else np.full((rows, 1), p) for p in parts]
-        raw = np.concatenate(columns, axis=1)[slice(None) if lengths else 0]
-    is_series = any(part.ndim for part in parts)
-    values = raw.astype(np.float64)
+        raw = np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
     scale, offset = (np.squeeze(x) if np.size(x) == 1 else np.asarray(x) for x in (how.scale, how.offset))
     for key, numbers in (("scale", scale), ("offset", offset)):
-        if numbers.ndim and numbers.shape != values.shape[is_series:]:
+        if numbers.ndim and numbers.shape != raw.shape[1:]:
             raise UsageError(
-                f"field {node}.{field} has {numbers.size} values of {key} for samples of shape "
-                f"{values.shape[is_series:]}",
+                f"field {name} has {numbers.size} values of {key} for samples of shape {raw.shape[1:]}",
                 hint="give one number, or one for each column",
             )
-    scaled = scale * values + offset
-    scaled = scaled if factor == 1.0 else factor * scaled
-    # A robot with hinges and slides has no unit. Count over all samples: a part of a file has the turns of the whole.
-    if is_series and scaled.size and (unit == "rad" or (not unit and field in ("position", "goal"))):
-        counted = checks.counted(scaled.reshape(len(scaled), -1), checks.TURN_RAD).reshape(scaled.shape)
-        if not np.array_equal(counted, scaled, equal_nan=True):
-            turning.add(field)
-            return counted
-    return scaled.astype(raw.dtype if raw.dtype.kind == "f" else np.float64)
+    scaled = scale * raw.astype(np.float64) + offset
+    return (scaled if factor == 1.0 else factor * scaled).astype(raw.dtype if raw.dtype.kind == "f" else np.float64)
 
 
 def _cut(table: Table, streams: Mapping[str, _Stream], samples: slice | None) -> int:
