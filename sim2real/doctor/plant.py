@@ -200,7 +200,7 @@ class Replay:
         self.drives, self.log = drives, log
         # Windows that are spread over the log; the first second has the start's motion.
         count = round(_WINDOW_S / drives.model.opt.timestep)
-        begin, end = log.state_t[0] + 0.3, min(log.state_t[-1], log.t[-1]) - _WINDOW_S - 0.01
+        begin, end = max(log.state_t[0], log.t[0]) + 0.3, min(log.state_t[-1], log.t[-1]) - _WINDOW_S - 0.01
         moved = np.linspace(begin, max(begin, end), _WINDOWS)
         first = np.unique(np.clip(np.searchsorted(log.state_t, moved), 1, len(log.state_t) - 2))
         self.starts = first[log.state_t[first] + _WINDOW_S <= log.state_t[-1] + 1e-9]

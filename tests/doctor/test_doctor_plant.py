@@ -1,6 +1,7 @@
 """The doctor's timing and plant questions, on a pendulum that another simulation moves."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -71,6 +72,16 @@ def test_the_fault_of_a_plant_is_named(setting: dict[str, float], fault: str, tm
         assert figures["kp"] == pytest.approx(0.5, abs=0.05)
     if fault == "delay":
         assert figures["delay_s"] == pytest.approx(0.035, abs=0.005)
+
+
+def test_windows_lie_where_the_policy_runs(tmp_path: Path) -> None:
+    """A recorder may begin long before the policy, while the robot is held by another controller."""
+    log = read_deployment(recorded(tmp_path), CONTRACT.joints)
+    assert log.target is not None
+    late = replace(log, t=log.t[150:], target=log.target[150:])
+    starts = plant.Replay(Drives(tmp_path / "robot.xml", CONTRACT), late).starts
+    assert len(starts) > 5
+    assert late.state_t[starts].min() >= late.t[0]
 
 
 def test_torque_at_the_limit_of_the_model_is_no_fault(tmp_path: Path) -> None:
