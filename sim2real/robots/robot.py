@@ -447,6 +447,7 @@ class Robot(RecordedRobot):
 
     Attributes:
         delay_spread_s: Largest deviation, up or down, of an episode's delay from that of the simulated loop [s].
+        tasks: Further tasks by name, each with its agent; see ``with_task``.
     """
 
     drive: RobotDrive
@@ -455,6 +456,7 @@ class Robot(RecordedRobot):
     task: RobotTask
     model: RobotModel
     delay_spread_s: float = 0.002
+    tasks: Mapping[str, tuple[RobotAgent, RobotTask]] = _NOTHING
 
     # -- what its parts say
 
@@ -496,6 +498,20 @@ class Robot(RecordedRobot):
         moved = copy.copy(self)
         moved.model = model
         return moved
+
+    def with_task(self, name: str) -> Self:
+        """Return the robot with another of its tasks, such as ``follow`` of an arm; identifications stay valid.
+
+        Raises:
+            UsageError: It has no task of this name.
+        """
+        if name not in self.tasks:
+            raise UsageError(
+                f"robot {self.name!r} has no further task {name!r}. Available: {', '.join(self.tasks) or 'none'}"
+            )
+        robot = copy.copy(self)
+        robot.agent, robot.task = self.tasks[name]
+        return robot
 
     def identified_mjcf(self, values: Mapping[str, Scalar]) -> str | None:
         return self.model.identified_mjcf(values)

@@ -10,14 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, InputState, StepState
 from sim2real.robots.messages import JointReading
+from sim2real.robots.servo.targets import AHEAD_S, FIGURE_HZ, FIGURE_M, arrival, figure_of_eight
 from sim2real.robots.servo.task import ServoMoment
 from sim2real.stages.load import load_module, load_robot
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
 from benches.hidden import arms
-from benches.hidden.targets import AHEAD_S, FIGURE_HZ, FIGURE_M, arrival, figure_of_eight, with_task
 
 THERE = {"arm": (0.5, 0.4, 0.3), "so101": (0.5, -0.8, 1.0, -1.2, 0.0, 0.0)}
 STEPS = 0.02 * np.arange(200)
@@ -69,7 +70,7 @@ def test_the_figure_of_eight_goes_to_either_side_twice_as_slowly_as_up_and_down(
 
 
 def test_every_point_of_the_drawn_figures_is_within_reach(arm):
-    task = with_task(arm.robot, "follow").task
+    task = arm.robot.with_task("follow").task
     for trial in range(12):
         numbers = task.at_rest(trial).aim
         q = arm.there
@@ -80,7 +81,7 @@ def test_every_point_of_the_drawn_figures_is_within_reach(arm):
 
 def test_reward_and_success_are_those_of_the_target_now(arm):
     for name in ("follow", "fast"):
-        task = with_task(arm.robot, name).task
+        task = arm.robot.with_task(name).task
 
         def judged(turn, task=task):
             now = arm.there + turn * np.eye(len(arm.there))[0]
@@ -96,7 +97,7 @@ def test_reward_and_success_are_those_of_the_target_now(arm):
 
 
 def test_the_policy_sees_the_target_of_its_step_and_the_task_judges_that_of_the_worlds_time(arm):
-    robot = with_task(arm.robot, "follow")
+    robot = arm.robot.with_task("follow")
     start = robot.task.at_rest(3)
     node, params = robot.agent.make(50.0), robot.agent.params(start, None)
     state = node.init_state(None, GraphState(params={"agent": params}))
@@ -116,11 +117,14 @@ def test_the_policy_sees_the_target_of_its_step_and_the_task_judges_that_of_the_
         np.testing.assert_allclose(moment.aim, np.concatenate(at), atol=1e-5)
 
 
-def test_an_arm_with_another_task_is_the_same_arm(arm):
-    fast = with_task(arm.robot, "fast")
+def test_a_robot_has_its_tasks_by_name_and_refuses_another(arm):
+    assert set(arm.robot.tasks) == {"follow", "fast"}
+    fast = arm.robot.with_task("fast")
     assert (fast.name, fast.model) == (arm.robot.name, arm.robot.model)
     assert fast.agent.action[0].high > arm.robot.agent.action[0].high
     assert arm.robot.task is not fast.task
+    with pytest.raises(UsageError, match="juggle"):
+        arm.robot.with_task("juggle")
 
 
 @pytest.mark.parametrize(
@@ -140,7 +144,7 @@ def test_a_tip_that_passes_by_has_not_arrived(distance_mm, settled_s, success, o
 
 
 def test_scores_compare_with_the_target_of_each_time(arm):
-    robot = with_task(arm.robot, "follow")
+    robot = arm.robot.with_task("follow")
     numbers, q, path = robot.task.at_rest(1).aim, arm.there, []
     for t_s in STEPS:
         q, _ = joints_at(arm, figure_of_eight(numbers, t_s), q)
@@ -160,7 +164,7 @@ def test_scores_compare_with_the_target_of_each_time(arm):
 
 
 def test_goals_that_are_ahead_by_delay_and_lag_follow_the_figure_on_a_hidden_arm_and_others_do_not(arm):
-    robot, hidden = with_task(arm.robot, "follow"), replace(arms.HiddenArm.draw(arm.name, 1, 2), load_kg=0.0)
+    robot, hidden = arm.robot.with_task("follow"), replace(arms.HiddenArm.draw(arm.name, 1, 2), load_kg=0.0)
     numbers, q = robot.task.at_rest(0).aim, arm.there
     path = []
     for t_s in np.arange(0.0, 1 / FIGURE_HZ + 1e-9, 0.02):

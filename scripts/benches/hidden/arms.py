@@ -197,7 +197,7 @@ def agent(robot: Any, runner: Callable[[np.ndarray], np.ndarray], trial: int) ->
 
 def judge(arm: HiddenArm, robot: Any, task: str, act: Act, trial: int, seconds: float) -> dict[str, float]:
     """Return the figures of a session with a trial's aim, by the true motion of the tip."""
-    from benches.hidden.targets import CLOSE_M, SETTLED_S, arrival
+    from sim2real.robots.servo.targets import CLOSE_M, SETTLED_S, arrival
 
     played = play(arm, robot, act, seconds, 1 + trial)
     tip = np.stack([played.states[f"tip[{i}]"] for i in range(3)], axis=-1)

@@ -5,10 +5,7 @@ Both move the goals as fast as the servos can follow: at the speed of a reaching
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Mapping
-from dataclasses import replace
-from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,7 +14,6 @@ from sim2real.later import jax, jnp
 from sim2real.robots.messages import JointReading
 from sim2real.robots.servo.servos import Servos
 from sim2real.robots.servo.task import Aim, AimTask, Feature, ServoAgent, ServoMoment, uniform
-from sim2real.stages.load import load_module
 from sim2real.types import Array, Key, Scalar
 
 FIGURE_HZ, FIGURE_M = 0.7, (0.05, 0.025)
@@ -31,36 +27,6 @@ SETTLED_S = 1.0
 _TARGET = tuple((f"target {axis}", "m") for axis in "xyz")
 _AHEAD = tuple((f"target {axis}, {AHEAD_S:g} s ahead", "m") for axis in "xyz")
 _AXES = "outwards, sideways, up"
-
-
-class ArmTasks(NamedTuple):
-    """What these tasks need of an arm.
-
-    Attributes:
-        speed_rad_s: Largest speed of the goals, near that of a servo.
-        centres: Lowest and highest joint angles of the centres of figures [rad].
-        still: Joints that do not move the tip, and shall stay at 0.
-    """
-
-    speed_rad_s: float
-    centres: tuple[tuple[float, ...], tuple[float, ...]]
-    still: tuple[int, ...] = ()
-
-
-ARMS = {
-    "arm": ArmTasks(5.0, ((-0.5, 0.3, 1.0), (0.5, 0.6, 1.3))),
-    "so101": ArmTasks(4.0, ((-0.5, -1.1, 0.8, -1.4, 0.0, 0.0), (0.5, -0.7, 1.1, -1.2, 0.0, 0.0)), (4, 5)),
-}
-
-
-def with_task(robot: Any, name: str) -> Any:
-    """Return an arm with the task ``follow`` or ``fast``; identifications stay valid."""
-    arm, module = ARMS[robot.name], load_module(robot.name, "robot")
-    servos, targets = replace(robot.drive.servos, speed=arm.speed_rad_s), (module.LOW, module.HIGH)
-    tasks = target_tasks(servos, module.tip_of, module.way, targets, arm.centres, still=arm.still)
-    robot = copy.copy(robot)
-    robot.agent, robot.task = tasks[name]
-    return robot
 
 
 def figure_of_eight(numbers: Array, t_s: Scalar) -> Array:
