@@ -96,8 +96,7 @@ def one(trial: Trial, seed: int) -> tuple[bool, float, float]:
     from sim2real.robots.walking.twin import STEP_S, HiddenTwin, Twin, walk
     from sim2real.stages.load import load_robot
 
-    found = load_robot(trial.pipeline)
-    robot: Any = found.load()
+    robot: Any = load_robot(trial.pipeline)
     rng = np.random.default_rng(seed)
     hidden = HiddenTwin.draw(np.random.default_rng(1000 + seed), len(robot.joints))
     if trial.delay_s is not None:
@@ -108,7 +107,7 @@ def one(trial: Trial, seed: int) -> tuple[bool, float, float]:
     commands = (
         rng.uniform(-1.0, 1.0, (count, 3)) * robot.commands.most * (rng.random((count, 1)) > robot.commands.stand)
     )
-    runner = load_bundle(trial.bundle or found.folder / "walk")
+    runner = load_bundle(trial.bundle or robot.folder / "walk")
     walked = walk(twin, runner, lambda t_s: commands[int(t_s / EVERY_S + 1e-6)], trial.seconds, trial.push_m_s)
     return walked.fell_s is not None, walked.error_m_s, walked.error_rad_s
 
