@@ -111,7 +111,8 @@ class Link:
             tried.append([*chosen[:count], Candidate("normaliser", made, _says("the observation is normalised with "
                                                                               "other numbers"))])  # fmt: skip
         best = min(tried, key=lambda c: self.error(c[-1].setting) * (1 + 0.1 * len(c)))
-        return best if self.error(best[-1].setting) < (_SOUND if clear else 0.5 * error) else chosen
+        # Two free numbers for each entry halve many an error: they must explain three quarters of it.
+        return best if self.error(best[-1].setting) < (_SOUND if clear else min(0.5 * error, 0.25 * before)) else chosen
 
     def _normaliser(self, how: Making) -> Making:
         """Return a making with the gain and the bias of each entry of the observation that fit best."""
