@@ -191,7 +191,9 @@ def _at_other_delays(problem: Problem, found: Refined, report: OnProgress | None
         J = problem.linearise(x, lively).jacobian.reshape(-1, len(x))
         for i, shift_s in itertools.product(delays, (-half_s, half_s)):
             others, start, column = np.delete(np.arange(len(x)), i), x.copy(), table.columns[i]
-            start[i] = column.to_scale(max(column.from_scale(x[i]) + shift_s, 0.0))
+            start[i] = column.to_scale(max(column.from_scale(x[i]) + shift_s, column.low))
+            if start[i] == x[i]:  # there is no shorter delay
+                continue
             # The others move as the linear model says; one that nothing determines stays.
             start[others] -= np.linalg.lstsq(J[:, others], J[:, i] * (start[i] - x[i]), rcond=1e-6)[0]
             starts.append(table.within(start))
