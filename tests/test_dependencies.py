@@ -18,6 +18,8 @@ IMPORTED_AS = {
     "dm-control": "dm_control", "dm-env": "dm_env", "dynamixel-sdk": "dynamixel_sdk", "mujoco-mjx": "mujoco.mjx",
     "pyserial": "serial", "pyyaml": "yaml", "rerun-sdk": "rerun", "scikit-learn": "sklearn",
 }  # fmt: skip
+OF_NODES = "distrax"
+"""What only the nodes of users import: their delays are distributions of distrax."""
 MAY_IMPORT = {
     "view": {"sim2real.view.rerun_recording", "sim2real.view.rerun_viewer", "sim2real.view.model_scene"},
     "hardware": {"sim2real.policy.runner"},
@@ -100,7 +102,7 @@ def importers(imported: dict[str, set[str]], package: str) -> set[str]:
     return {module for module, names in imported.items() if imports_package(names, package)}
 
 
-@pytest.mark.parametrize("requirement", PROJECT["dependencies"])
+@pytest.mark.parametrize("requirement", [r for r in PROJECT["dependencies"] if not r.startswith(OF_NODES)])
 def test_what_a_plain_installation_brings_is_used_by_a_command(requirement, imported, reached):
     assert importers(imported, package_of(requirement)) & reached
 
