@@ -30,6 +30,7 @@ TABLES = {
     "latency": ("latency.table", "latency_league"),
     "randomise": ("hidden.randomise.table", "randomise", "randomise_worn"),
     "pays": ("pays.table", "pays"),
+    "doctor": ("doctor.table", "doctor"),
     "compiled": ("graph.table", "graph_h200"),
     "on_a_gpu": ("train.table", "train_h200"),
     "warp": ("compose.table", "compose_warp_h200"),
