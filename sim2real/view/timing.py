@@ -25,9 +25,11 @@ def timing_tiles(episodes: Sequence[Episode]) -> Iterator[Tile]:
     if any(map(is_imported, episodes)):
         return
     nodes = [(name, node) for e in episodes for name, node in Timing.of(e).nodes.items()]
-    late = [(node.lateness.p99, name) for name, node in nodes if node.lateness.p99 is not None]
-    worst_s, name = max(late)
-    yield Tile("lateness, p99", f"{1e3 * worst_s:.2f} ms", f"of {name}, the worst node")
+    if any(is_virtual(e) for e in episodes):
+        yield Tile("lateness", "none", "an embedded robot runs in virtual time")
+    else:
+        worst_s, name = max((node.lateness.p99, name) for name, node in nodes if node.lateness.p99 is not None)
+        yield Tile("lateness, p99", f"{1e3 * worst_s:.2f} ms", f"of {name}, the worst node")
     # Lateness does not show old messages, so show the oldest input, too.
     if old := [(age.max, name) for name, node in nodes for age in node.age.values() if age.max is not None]:
         oldest_s, name = max(old)
@@ -36,6 +38,11 @@ def timing_tiles(episodes: Sequence[Episode]) -> Iterator[Tile]:
         end: Mapping[str, Json] = episodes[-1].metadata.get("log", {}).get("session_end") or {}
         lost = end.get("lost_replies")  # the count covers all episodes of a session
         yield Tile("overruns", str(sum(overruns)), f"{lost} lost replies" if lost is not None else "")
+
+
+def is_virtual(episode: Episode) -> bool:
+    """Return whether an episode is one of an embedded robot, on whose clock no thread is late."""
+    return episode.metadata.get("port") == "embedded"
 
 
 def timing_blocks(episode: Episode, name: str, which: str = "", folded: bool = False) -> list[Block]:
@@ -54,20 +61,22 @@ def timing_blocks(episode: Episode, name: str, which: str = "", folded: bool = F
 
 
 def schedule(episode: Episode, name: str) -> str:
-    """Draw when nodes computed and waited, in the middle of the episode and around the latest wake-up."""
+    """Draw when nodes computed and waited, in an episode's middle and, in real time, around the latest wake-up."""
     nodes = [n for n in in_order(episode) if len(episode.steps[n])]
     length = _PERIODS_SHOWN * 1e6 * slowest_period_s(episode)
-    # Find the latest wake-up, which the right plot shows.
+    # Find the latest wake-up, which the lower plot shows.
     late = {n: episode.steps[n].woken - episode.steps[n].start for n in nodes}
     worst = max(nodes, key=lambda n: late[n].max())
     moment = int(episode.steps[worst].start[late[worst].argmax()])
     middle = int(1e6 * episode.duration_s / 2)
     with styled():
-        figure = new_figure(1.5 + 0.75 * len(nodes), style.PHONE_IN)
-        titles = (f"At {middle / 1e6:.1f} s", f"Around the latest wake-up: {worst}, {late[worst].max() / 1e3:.1f} ms")
-        grid = figure.subplots(2, 1, sharey=True)
+        titles = [f"At {middle / 1e6:.1f} s", f"Around the latest wake-up: {worst}, {late[worst].max() / 1e3:.1f} ms"]
+        titles = titles[:1] if is_virtual(episode) else titles
+        figure = new_figure((1.5 + 0.75 * len(nodes)) * len(titles) / 2 + 0.2, style.PHONE_IN)
+        grid = figure.subplots(len(titles), 1, sharey=True, squeeze=False)[:, 0]
         # Draw steps as bars and messages as arrows, in the middle and around the latest wake-up.
-        for axes, begin, title in zip(grid, (middle, max(0, moment - int(0.4 * length))), titles, strict=True):
+        begins = (middle, max(0, moment - int(0.4 * length)))
+        for axes, begin, title in zip(grid, begins, titles, strict=False):
             for row, node in enumerate(nodes):
                 look = color_of(episode, node, BLUE)
                 _bars(axes, episode.steps[node], row, begin, begin + length, look)
