@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from sim2real.artifacts.files import plain
+from sim2real.artifacts.paths import shown
 from sim2real.artifacts.run import STAGES, attempts, run_folders, stage_status, versions
 from sim2real.commands import flags
 from sim2real.commands.stages import DEMO_PIPELINE
@@ -17,7 +18,7 @@ from sim2real.runtime import compilation_cache
 from sim2real.stages.flag import Flag
 from sim2real.stages.load import available, folder_of, load_robot, summary_of
 from sim2real.stages.shared.find_run import find_run
-from sim2real.stages.terminal.console import pairs, shown, table
+from sim2real.stages.terminal.console import pairs, table
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sim2real.artifacts.paths import shown
 from sim2real.commands import flags
 from sim2real.commands.run_flags import DemoFlags, RunFlags
 from sim2real.commands.stages import DEMO_PIPELINE, run_stage, split_pipeline, write_report
@@ -71,13 +72,12 @@ def conclude(run_dir: Path) -> None:
     """Write the page of a run; print the verdict and the name of the page."""
     from sim2real.artifacts.deployment import Deployment
     from sim2real.artifacts.run import finished
-    from sim2real.stages.terminal import console
 
     page = write_report(run_dir)
     deployed = finished(run_dir, "deploy")
     advice = None if deployed is None else Deployment.read(deployed.folder).advice
     result = "the run is finished" if advice is None else f"{advice.status}: {'; '.join(advice.reasons)}"
-    print(f"{result}. {f'Open {console.shown(page)}' if page else ''}".rstrip(), flush=True)
+    print(f"{result}. {f'Open {shown(page)}' if page else ''}".rstrip(), flush=True)
 
 
 def main_figures(done: StageFolder) -> dict[str, Any]:

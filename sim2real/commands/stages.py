@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Generic, TypeVar
 
+from sim2real.artifacts.paths import shown
 from sim2real.commands import flags
 from sim2real.errors import ERROR, UsageError
 from sim2real.installation import has_jax
@@ -119,7 +120,7 @@ def write_report(run_dir: Path) -> Path | None:
     from sim2real.stages.terminal import console
 
     if not has_jax():
-        console.note(f"no page: `sim2real report {console.shown(run_dir)}` writes it on a computer with sim2real")
+        console.note(f"no page: `sim2real report {shown(run_dir)}` writes it on a computer with sim2real")
         return None
     with console.progress(None, "report"):
         from sim2real.view.page import report  # matplotlib and jinja2 take 0.5 s to import

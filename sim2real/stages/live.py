@@ -16,9 +16,10 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from sim2real.artifacts.paths import shown
 from sim2real.errors import Sim2RealError
 from sim2real.robots.robot import RecordedRobot, Robot
-from sim2real.stages.terminal.console import note, shown
+from sim2real.stages.terminal.console import note
 from sim2real.types import Json
 from sim2real.view.live.follower import PERIOD_S, Follower
 from sim2real.view.model_scene import ModelScene

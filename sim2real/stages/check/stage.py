@@ -15,6 +15,7 @@ import numpy as np
 
 from sim2real import pytree
 from sim2real.artifacts.files import plain, to_json
+from sim2real.artifacts.paths import shown
 from sim2real.artifacts.run import newest
 from sim2real.artifacts.summary import ArtifactTable, Shown
 from sim2real.errors import NotInstalled, Sim2RealError, UsageError
@@ -33,7 +34,7 @@ from sim2real.stages.load import AnyRobot, defaults_of, robot_of
 from sim2real.stages.session.excitation import played
 from sim2real.stages.shared.arguments import AnyRecording, config_of, open_recording, recordings_of
 from sim2real.stages.shared.identification import command, side_by_side, usable
-from sim2real.stages.terminal.console import artifact_table, note, pairs, progress, shown
+from sim2real.stages.terminal.console import artifact_table, note, pairs, progress
 from sim2real.types import Json
 
 PLANNED = "planned excitation"

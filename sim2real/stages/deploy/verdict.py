@@ -13,6 +13,7 @@ import numpy as np
 from sim2real.artifacts.bundle import GOOD_SUCCESS, Bundle
 from sim2real.artifacts.deployment import AS_HERE, Advice, Changed, Deployment, Drift, Gap, Replay
 from sim2real.artifacts.identification import MAX_ERROR_RATIO, ROUND_TRIP, Identification
+from sim2real.artifacts.paths import shown
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run import MANIFEST
 from sim2real.artifacts.timing import Timing
@@ -21,7 +22,7 @@ from sim2real.installation import has_jax
 from sim2real.robots.robot import RecordedRobot, in_world
 from sim2real.stages.load import defaults_of
 from sim2real.stages.shared.identification import command
-from sim2real.stages.terminal.console import progress, shown
+from sim2real.stages.terminal.console import progress
 from sim2real.stages.terminal.interruption import patiently
 
 _FAULTY_RATIO = 2.0

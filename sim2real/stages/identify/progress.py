@@ -14,13 +14,14 @@ from pathlib import Path
 import numpy as np
 
 from sim2real.artifacts.identification import Estimate, Identification, Judgement
+from sim2real.artifacts.paths import shown
 from sim2real.artifacts.progress import write_progress
 from sim2real.artifacts.run import OpenStage
 from sim2real.identification.fit import as_numbers
 from sim2real.identification.parameters import ParameterTable
 from sim2real.stages.identify.inputs import Inputs
 from sim2real.stages.live import live_view
-from sim2real.stages.terminal.console import note, shown
+from sim2real.stages.terminal.console import note
 
 PARTIAL = "partial.json"
 

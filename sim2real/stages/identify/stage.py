@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from sim2real.artifacts.identification import PARAMETERS, Identification
+from sim2real.artifacts.paths import shown
 from sim2real.artifacts.run import OpenStage, StageFolder, newest, open_stage
 from sim2real.errors import UsageError
 from sim2real.identification.uncertainty import noises
@@ -24,7 +25,7 @@ from sim2real.stages.identify.show import show, summary
 from sim2real.stages.load import AnyRobot, defaults_of, robot_of
 from sim2real.stages.shared.arguments import AnyRecording, config_of, open_recording, recordings_of
 from sim2real.stages.shared.identification import command, continuing, identified_robot
-from sim2real.stages.terminal.console import progress, shown
+from sim2real.stages.terminal.console import progress
 
 
 def identify(

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sim2real.artifacts import run as run_folder
+from sim2real.artifacts.paths import shown
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
@@ -19,7 +20,7 @@ from sim2real.robots.model.file import read_model
 from sim2real.robots.model.robot import MjcfRobot
 from sim2real.stages.import_logs.config import ImportConfig
 from sim2real.stages.load import folder_of, load_robot
-from sim2real.stages.terminal.console import note, pairs, shown, wrote
+from sim2real.stages.terminal.console import note, pairs, wrote
 
 
 def run(config: ImportConfig) -> None:

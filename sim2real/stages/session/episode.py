@@ -89,7 +89,6 @@ def opened(robot: Robot, config: RecordConfig | DeployConfig, truth_path: Path) 
 
     Args:
         config: Port, limits, seed, and whether it is a dry run.
-
     """
     if config.dry_run:
         note("dry run: torque stays off and no goal is sent; what would have been sent is logged")

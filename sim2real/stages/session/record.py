@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sim2real.artifacts.paths import shown
 from sim2real.artifacts.recording import LOG, TRUTH, Recording
 from sim2real.artifacts.run import StageFolder, open_stage
 from sim2real.installation import has_jax
@@ -20,7 +21,7 @@ from sim2real.stages.session.config import RecordConfig
 from sim2real.stages.session.episode import check_deadlines, opened, show_sessions
 from sim2real.stages.session.excitation import played
 from sim2real.stages.shared.arguments import AnyPath, config_of, folder_of
-from sim2real.stages.terminal.console import note, shown, table
+from sim2real.stages.terminal.console import note, table
 from sim2real.types import Json
 
 

@@ -13,7 +13,7 @@ from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sim2real.artifacts.paths import shown as shown
+from sim2real.artifacts.paths import shown
 
 if TYPE_CHECKING:
     from sim2real.artifacts.summary import ArtifactTable

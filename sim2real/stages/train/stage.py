@@ -12,6 +12,7 @@ import jax
 
 from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.identification import Identification
+from sim2real.artifacts.paths import shown
 from sim2real.artifacts.progress import write_progress
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run import RUNNING, StageFolder, attempts, newest, open_stage, run_folders, sha256
@@ -31,7 +32,7 @@ from sim2real.stages.shared.arguments import (
     recordings_of,
 )
 from sim2real.stages.shared.find_run import find_run, warn_of_stale
-from sim2real.stages.terminal.console import artifact_table, note, progress, shown
+from sim2real.stages.terminal.console import artifact_table, note, progress
 from sim2real.stages.terminal.interruption import patiently
 from sim2real.stages.train.bundle import Watch, bundle_of_training, contract_of, disturbance_rows
 from sim2real.stages.train.config import TrainConfig

@@ -19,6 +19,7 @@ from sim2real.artifacts.identification import (
     Identification,
     compared_table,
 )
+from sim2real.artifacts.paths import shown
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.summary import ArtifactTable, Shown
 from sim2real.errors import Sim2RealError, UsageError
@@ -36,7 +37,7 @@ from sim2real.stages.load import AnyRobot, defaults_of, load_robot, robot_of
 from sim2real.stages.shared import arguments
 from sim2real.stages.shared.arguments import AnyIdentification, AnyRecording, open_recording
 from sim2real.stages.shared.identification import command, identified_robot, side_by_side, usable, was_fitted
-from sim2real.stages.terminal.console import artifact_table, note, progress, shown
+from sim2real.stages.terminal.console import artifact_table, note, progress
 from sim2real.stages.validate.config import ValidateConfig
 from sim2real.types import Json
 
