@@ -96,8 +96,9 @@ class Case:
 CALMER = {"learning_rate": 1.5e-3, "log_std_init": -1.5}
 CASES = {
     "pendulum": Case(("swing_up",), 1, 10, 8.0, 40.0, {"swing_up": 3_000_000}, {}),
-    # With 1.5 million steps three of five trainings on the arm's posterior were at their beginning: success 5 to 80 %.
-    "arm": Case(("follow", "fast"), 4, 3, 4.0, 40.0, {"follow": 3_000_000, "fast": 1_500_000}, CALMER),
+    # With 1.5 million steps three of five trainings on the arm's posterior were at their beginning: success 5 to 80 %;
+    # of the fast task nine of twenty ended below 75 %, data sheet and all others alike.
+    "arm": Case(("follow", "fast"), 4, 3, 4.0, 40.0, {"follow": 3_000_000, "fast": 3_000_000}, CALMER),
     "so101": Case(("follow", "fast"), 4, 3, 4.0, 40.0, {"follow": 1_500_000, "fast": 1_500_000}, CALMER),
     "go2": Case(("walk",), 4, 1, 20.0, 12.0, {"walk": 60_000_000}, {}),
 }
