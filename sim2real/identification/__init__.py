@@ -43,6 +43,6 @@
     for line in (judgement.status, *judgement.reasons):
         print(line)
 
-In the order of the data: ``segments``, ``rollouts``, ``residuals``, ``problem``, ``search``, ``fit``, ``uncertainty``,
+In the order of the data: ``segments``, ``rollouts``, ``residuals``, ``search``, ``fit``, ``uncertainty``,
 ``predictions``, ``held_out``, ``terms``, ``expected``, ``verdict``; beside it ``delays``, ``drift``, ``export``.
 """

@@ -17,7 +17,7 @@ from scipy.interpolate import BSpline
 from sim2real.artifacts.identification import Link, Ranged
 from sim2real.errors import UsageError
 from sim2real.identification.parameters import ParameterTable
-from sim2real.identification.problem import Problem
+from sim2real.identification.residuals import Problem
 
 _STEP_S = 0.001
 """Distance of the delays at which the motion is predicted [s]."""
@@ -514,7 +514,7 @@ class _Watched:
             values = values | {self._late: late}
             states.append(problem.rollouts.starts(values, self._segments, np.zeros_like(shift), problem.data))
         same = (states[0] - states[1]) / problem.rollouts.prior
-        return problem.residuals.errors(values, self._segments, shift + same)
+        return problem.errors(values, self._segments, shift + same)
 
 
 def _side_by_side(problem: Problem) -> np.ndarray:

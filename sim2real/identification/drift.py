@@ -11,8 +11,7 @@ from sim2real.artifacts.identification import ROUND_TRIP
 from sim2real.artifacts.posterior import Posterior, Transform
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.identification.parameters import ParameterTable
-from sim2real.identification.problem import Problem
-from sim2real.identification.residuals import Linearised
+from sim2real.identification.residuals import Linearised, Problem
 from sim2real.identification.uncertainty import loss_variance
 
 LEVEL = 0.05

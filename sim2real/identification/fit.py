@@ -15,8 +15,7 @@ from sim2real.graph.episode import Episode
 from sim2real.identification.config import FitConfig
 from sim2real.identification.model import IdentifiableModel
 from sim2real.identification.parameters import ParameterTable
-from sim2real.identification.problem import MOST_OF_FIT, Problem, few_of, of_recordings, thinned
-from sim2real.identification.residuals import Part, robust
+from sim2real.identification.residuals import MOST_OF_FIT, Part, Problem, few_of, of_recordings, robust, thinned
 from sim2real.identification.search import SearchResult, search
 from sim2real.identification.segments import Span
 from sim2real.identification.uncertainty import (
@@ -184,7 +183,7 @@ def _at_other_delays(problem: Problem, found: Refined, report: OnProgress | None
     delays = [i for i, c in enumerate(table.columns) if c.kind == "delay"]
     if not delays:
         return found
-    nodes, lively = problem.rollouts.graph.nodes, problem.residuals.liveliest(problem.part())
+    nodes, lively = problem.rollouts.graph.nodes, problem.liveliest(problem.part())
     half_s = 0.5 / min(nodes[name].rate for name in problem.model.given)
     for _ in range(_TRIES):
         x, starts = found.x, []
@@ -239,7 +238,7 @@ def run_search(problem: Problem, start: np.ndarray, report: OnProgress | None = 
     """
     config, table = problem.config, problem.table
     # Few segments suffice for a search: all 23 of an arm took 2.6 times as long.
-    few = problem.residuals.liveliest(problem.part())
+    few = problem.liveliest(problem.part())
 
     def losses(candidates: np.ndarray, middle: np.ndarray) -> np.ndarray:
         return problem.losses(candidates, middle, few)
@@ -281,7 +280,7 @@ def refine(
             hint="search first, with generations above 0, or check the nominal values",
         )
     # Descend roughly from each start, and further from those that may lead to the best end.
-    fine, first_gain = problem.residuals.precision, gain or _COARSE
+    fine, first_gain = problem.precision, gain or _COARSE
     ends = list(starts[np.isfinite(first)])
     if len(ends) > 1:
         rough = sorted((descent.down(x, max(_ROUGHLY, first_gain)) for x in ends), key=lambda end: end[1])
@@ -412,7 +411,7 @@ class _Descent:
 
     def _pulled(self, x: np.ndarray) -> float:
         """Return what the pull to the nominal values adds to the loss."""
-        count = self._problem.residuals.compared(self._problem.part()).sum() * len(self._problem.fields)
+        count = self._problem.compared(self._problem.part()).sum() * len(self._problem.fields)
         return 0.5 * float(np.sum((self._deviation * self._weight * (x - self._nominal)) ** 2) / max(count, 1))
 
     def _round(self, x: np.ndarray, gain: float) -> np.ndarray:
@@ -422,8 +421,8 @@ class _Descent:
         than the rollouts of an arm.
         """
         problem, table, config = self._problem, self._problem.table, self._problem.config
-        there = problem.residuals.near(x, self._part, self._slopes)
-        free, near = self._part.present.copy(), max(_NEAR, problem.residuals.precision)
+        there = problem.near(x, self._part, self._slopes)
+        free, near = self._part.present.copy(), max(_NEAR, problem.precision)
 
         def normal(y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             """Return the robust residuals, half the gradient and half the second derivatives without the pull."""
@@ -442,7 +441,7 @@ class _Descent:
         shape, priors = (len(self._part.live), -1, len(problem.fields)), sum(c.prior is not None for c in table.columns)
         stretch = robust(there.residuals(x), config.reach)[1]
         left = r + stretch * (there.jacobian(x) @ step)
-        compared = problem.residuals.compared(self._part)
+        compared = problem.compared(self._part)
         self._deviation = deviation(left[: len(left) - priors].reshape(shape), compared)
         pull, damping, failed, y = (self._deviation * self._weight) ** 2, _DAMPING, 0, x
         cost = float(r @ r) + float(pull @ (y - self._nominal) ** 2)

@@ -17,8 +17,7 @@ from sim2real.errors import UsageError
 from sim2real.identification.fit import Fit, bounded_step, refine, with_terms
 from sim2real.identification.parameters import ParameterTable
 from sim2real.identification.predictions import labels
-from sim2real.identification.problem import Problem
-from sim2real.identification.residuals import Linearised
+from sim2real.identification.residuals import Linearised, Problem
 from sim2real.identification.segments import Span, on_grid
 
 MOST = 12

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from sim2real.artifacts.identification import WorstSecond, worst_window
 from sim2real.graph.node import TICKS_PER_S
 from sim2real.identification.model import IdentifiableModel, position_of
-from sim2real.identification.problem import Problem
+from sim2real.identification.residuals import Problem
 from sim2real.log.schema import unit_of
 
 GOAL = "told"

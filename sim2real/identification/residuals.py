@@ -1,25 +1,32 @@
-"""Residuals, losses and derivatives of segments: numpy on the host, around ``Rollouts.errors``.
+"""Segments of recordings, simulated with any parameters: residuals, losses and derivatives, by numpy on the host.
 
-Each evaluation solves for the initial states of the segments, so that a fit is over dynamics and delays alone (variable
-projection; the derivative neglects the change of the states' slopes: Kaufman, BIT 15, 1975). Rollouts take most of the
-time: the slopes of initial states are reused while parameters change little, and one rollout serves several parameters
-or states if no residual depends on two of them.
+Each segment is simulated with the recorded commands and timing. Each evaluation solves for the initial states of the
+segments, so that a fit is over dynamics and delays alone (variable projection; the derivative neglects the change of
+the states' slopes: Kaufman, BIT 15, 1975). Rollouts take most of the time: the slopes of initial states are reused
+while parameters change little, and one rollout serves several parameters or states if no residual depends on two of
+them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import copy
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
-import mujoco
+import jax.numpy as jnp
 import numpy as np
 
-from sim2real.identification.rollouts import Rollouts
-from sim2real.identification.segments import Data
-from sim2real.types import MjModel
-
-mj: Any = mujoco
+from sim2real.errors import UsageError
+from sim2real.graph.episode import Episode
+from sim2real.graph.schedule import draw
+from sim2real.graph.windows import make_room
+from sim2real.identification.config import FitConfig
+from sim2real.identification.derivatives import Groups, Nearby, trees_are_apart
+from sim2real.identification.model import Channel, IdentifiableModel
+from sim2real.identification.parameters import ParameterTable
+from sim2real.identification.rollouts import Engine, Rollouts, choose_engine
+from sim2real.identification.segments import Data, Span, cut, data_of, padded, rounded
 
 _STATE_STEPS = 2
 """Gauss-Newton steps of an initial state. With one, the loss of a pendulum's log jumped by 3 % where the delays changed
@@ -28,14 +35,16 @@ _STATE_DIFFERENCE = 0.03
 """Step of finite differences by an initial state, in its prior deviation."""
 _CACHED = 3
 """Cached points: a descent evaluates its end, then begins its next round there."""
-_RESPONDS = 1e-9
-"""Share of the largest derivative below which a residual is independent of a column; decoupled derivatives are exactly
-0."""
-_TRUSTED = 0.3
-"""Largest error of the predicted change of the residuals, as a share of it, with which a Jacobian is corrected."""
 _SEARCHED = 8
 """Fewest segments that a search simulates; at least two for each channel."""
-Stacked = Callable[[np.ndarray], np.ndarray]
+MOST_OF_FIT = 4e7
+"""Steps of single joints in a Jacobian from which a fit takes fewer segments: about 30 s on two cores."""
+MOST_OF_SETS = 8e6
+"""The same for the first of two descents, for baselines and for sets of terms that are compared: about 4 s."""
+_BESIDE = 4
+"""Joints whose steps take as long as what a step of a model takes beside its joints."""
+_FEWEST = 2
+"""Fewest segments of a channel that are live."""
 
 
 @dataclass(frozen=True)
@@ -109,101 +118,120 @@ class _States(NamedTuple):
     residuals: np.ndarray
 
 
-class Groups:
-    """Columns of a Jacobian that finite differences move together, as no residual depends on two of them.
-
-    Method of Curtis, Powell and Reid (J. Inst. Maths Applics 13, 1974). Joints of separate trees move independently, so
-    the motors' strengths of four legs need one rollout.
+class Problem:
+    """Segments of recordings, which can be simulated with any parameters.
 
     Args:
-        apart: Whether only bodies couple joints; otherwise each column is moved alone.
-        by_tree: Whether a column belongs to all residuals of its tree, as states do that couple at other points.
-    """
-
-    def __init__(self, apart: bool, by_tree: bool = False) -> None:
-        self._apart, self._by_tree, self._belongs = apart, by_tree, np.zeros((0, 0), bool)
-
-    def members(self, columns: Sequence[int]) -> list[list[int]]:
-        """Return the groups of some columns; each alone before the first Jacobian is known."""
-        if not self._belongs.size:
-            return [[c] for c in columns]
-        groups: list[tuple[list[int], np.ndarray]] = []
-        for c in columns:
-            belongs = self._belongs[c]
-            free = next((g for g in groups if not (g[1] & belongs).any()), None)
-            if free is None:
-                groups.append(([c], belongs.copy()))
-            else:
-                free[0].append(c)
-                np.logical_or(free[1], belongs, out=free[1])
-        return [members for members, _ in groups]
-
-    def spread(self, changes: np.ndarray, groups: Sequence[Sequence[int]], size: int) -> np.ndarray:
-        """Return derivatives ``(..., F, size)`` from those along groups ``(G, ..., F)``; the first ones form groups."""
-        J = np.zeros((*changes.shape[1:], size))
-        for change, members in zip(changes, groups, strict=True):
-            for c in members:
-                J[..., c] = change if len(members) == 1 else np.where(self._belongs[c], change, 0.0)
-        if self._apart and not self._belongs.size:
-            self._belongs = self._found(np.abs(J).max(axis=tuple(range(J.ndim - 2))).T)
-        return J
-
-    def _found(self, slope: np.ndarray) -> np.ndarray:
-        """Return which residuals belong to each column ``(n, F)``, bool, from the largest derivatives ``(n, F)``."""
-        belongs = slope > _RESPONDS * slope.max(axis=1, keepdims=True)
-        if self._by_tree:
-            for _ in range(len(belongs)):  # columns that share a residual share all of them
-                shares = (belongs.astype(int) @ belongs.T.astype(int)) > 0
-                belongs = (shares.astype(int) @ belongs.astype(int)) > 0
-        # A column without effect at this point may have one elsewhere: it is moved alone.
-        belongs[~belongs.any(axis=1)] = True
-        return belongs
-
-
-def trees_are_apart(model: MjModel | None) -> bool:
-    """Return whether only bodies couple joints: there is no contact, equality or tendon."""
-    if model is None:
-        return False
-    contacts = model.opt.disableflags & mj.mjtDisableBit.mjDSBL_CONTACT == 0
-    touching = contacts and (model.npair > 0 or bool(np.any(model.geom_contype) and np.any(model.geom_conaffinity)))
-    return model.ntree > 1 and not touching and model.neq == 0 and model.ntendon == 0
-
-
-class Residuals:
-    """The residuals of the fitted segments of a problem.
-
-    Args:
-        train: Numbers of the fitted segments.
-        ts: Shape ``(E, K)``: time of each measurement [s]; -1 without a comparison.
-        like: Residuals of the same model, whose groups are shared.
+        length_s: Length of a segment [s].
+        like: Another problem of the same model, table and configuration; both share programs.
 
     Attributes:
+        data: The segments, as an argument of programs.
+        spans: The segments, recording by recording.
+        train: Numbers of the fitted segments.
+        readings: Field -> its measurements ``(E, K, ...)``.
+        ts: Shape ``(E, K)``: time of each measurement [s from the segment's start]; -1 without a comparison.
         precision: Relative change of the loss below which the noise of finite differences dominates: a round keeps the
             slopes of initial states, so near the minimum its slope differs from the loss's.
+
+    Raises:
+        Sim2RealError: When a log lacks a node or a field, or holds NaN.
+        UsageError: When a segment holds too few measurements.
     """
 
     def __init__(
-        self, rollouts: Rollouts, data: Data, train: np.ndarray, ts: np.ndarray, like: Residuals | None = None
+        self,
+        model: IdentifiableModel,
+        recordings: Sequence[Episode],
+        spans: Sequence[Span],
+        length_s: float,
+        config: FitConfig = FitConfig(),  # noqa: B008 - frozen
+        table: ParameterTable | None = None,
+        like: Problem | None = None,
     ) -> None:
-        self._rollouts, self._data, self._train, self._ts = rollouts, data, train, ts
-        self._table, self._config = rollouts.table, rollouts.config
-        self._n, self._free = len(rollouts.prior), rollouts.config.initial_state == "free"
+        self.model, self.config, self._recordings = model, config, recordings
+        self.table = like.table if like else (table or model.parameters)
+        if like:
+            self.rollouts = like.rollouts
+        else:
+            nodes = model.nodes(config.max_delay_s)
+            engine = choose_engine(config.engine, nodes, model.given)
+            self.rollouts = Rollouts(model, nodes, self.table, config, engine)
+        nodes = self.rollouts.graph.nodes
+        # Commands sent before a segment still act in it, up to the largest delay.
+        cuts = cut(model, nodes, recordings, spans, length_s, 2 * config.max_delay_s)
+        self.spans, self.segment_s, self.messages = cuts.spans, length_s, cuts.messages
+        # Complete the recorded timing: draw the steps of the simulated nodes.
+        self.timeline = draw(nodes, length_s + model.ahead_s, recorded=cuts.timeline)
+        make_room(nodes, self.timeline)  # after a hiccup commands leave in a burst
+        # Number the segments.
+        self.segments = len(cuts.spans)
+        self.begins_s = np.array([s.begin_s for s in cuts.spans])
+        self.recording = np.array([s.recording for s in cuts.spans])
+        self.train = np.flatnonzero([s.fitted for s in cuts.spans])
+        # Earlier measurements show the world before the start of the segment.
+        from_s = max(config.max_delay_s + 1.0 / min(n.rate for n in nodes.values()), config.skip_s)
+        if not np.any(cuts.ts >= from_s):
+            raise UsageError(
+                f"segments of {length_s:g} s have no measurement after their first {from_s:g} s to compare with",
+                hint="make them longer, or max_delay_s or skip_s smaller",
+            )
+        # Make the arguments of the programs.
+        tables = self.rollouts.graph.tables(self.timeline, cuts.messages)
+        tables[model.sensor] = padded(tables[model.sensor], rounded(cuts.ts.shape[1]), axis=1)
+        self.data: Data = data_of(cuts, tables, from_s)
+        self.readings, self.ts = cuts.measured, np.where(cuts.ts >= from_s, cuts.ts, -1.0)
+        self._n, self._free = len(self.rollouts.prior), config.initial_state == "free"
         self.precision = 1e-4 if self._free else 1e-5
-        apart, compiled = trees_are_apart(rollouts.engine.model), rollouts.engine.model is None
+        # Problems of one model share the groups of columns that move together. Joints of a compiled world may act on
+        # each other at other points: its groups are for steps alone.
+        apart, compiled = trees_are_apart(self.engine.model), self.engine.model is None
         self._groups: Groups = like._groups if like else Groups(apart)
-        # Joints of a compiled world may act on each other at other points: its groups are for steps alone.
         self._step_groups: Groups = like._step_groups if like else Groups(True) if compiled else self._groups
         self._state_groups: Groups = like._state_groups if like else Groups(apart, by_tree=True)
+        self._forget()
+
+    def _forget(self) -> None:
+        """Empty the caches of points."""
         self._last_states: list[tuple[bytes, bool, _States]] = []
         self._last: list[tuple[np.ndarray, Part, Linearised, np.ndarray]] = []
 
-    # -- what a fit asks for
+    @property
+    def engine(self) -> Engine:
+        """The engine of rollouts."""
+        return self.rollouts.engine
 
-    def linearise(self, x: np.ndarray, part: Part) -> Linearised:
+    @property
+    def channels(self) -> tuple[Channel, ...]:
+        """The measured channels."""
+        return self.model.channels
+
+    @property
+    def fields(self) -> list[Any]:
+        """The columns of the residuals: field, deviation, and a function that takes the channel's entry."""
+        return self.rollouts.fields
+
+    def measured(self, column: int) -> np.ndarray:
+        """Return the measurements of a column of the residuals, ``(E, K)``."""
+        field, _, entry = self.fields[column]
+        return np.asarray(entry(self.readings[field]))
+
+    def part(self, without: Sequence[int] | np.ndarray = (), present: np.ndarray | None = None) -> Part:
+        """Return the fitted segments but for some, and some of the parameters.
+
+        Args:
+            without: Numbers of the segments that are left out.
+            present: Shape ``(P,)``, bool: which free parameters are part of the model; default: all.
+        """
+        columns = np.ones(len(self.table), bool) if present is None else np.asarray(present, bool)
+        return Part(~np.isin(self.train, np.asarray(without, int)), columns)
+
+    def linearise(self, x: np.ndarray, part: Part | None = None) -> Linearised:
         """Return the residuals of the fitted segments and their derivatives at ``x (P,)``; the last points are cached.
 
         Segments that are not live have residuals and derivatives 0, and are not compared.
         """
+        x, part = np.asarray(x, np.float64), part or self.part()
         for point, known, there, _ in self._last:
             if np.array_equal(point, x) and known.key == part.key:
                 return there
@@ -212,24 +240,25 @@ class Residuals:
         groups = self._groups.members(np.flatnonzero(part.present).tolist())
         low, high = (self._moved(x, groups, sign) for sign in (-1.0, 1.0))
         both = self._raw(np.concatenate([high, low]), states, part)
-        width = np.clip(x + self._step, None, self._table.high) - np.clip(x - self._step, self._table.low, None)
+        width = np.clip(x + self._step, None, self.table.high) - np.clip(x - self._step, self.table.low, None)
         J = self._groups.spread(both[: len(groups)] - both[len(groups) :], groups, len(x)) / width
-        r, slope = robust(raw, self._config.reach)
+        r, slope = robust(raw, self.config.reach)
         prior, of_prior = self._prior(x), self._prior_slope(x)
-        precision = of_prior.T @ of_prior + np.diag(12.0 / self._table.span**2)
+        precision = of_prior.T @ of_prior + np.diag(12.0 / self.table.span**2)
         loss = self._loss(r, prior, part)
         there = Linearised(r, slope[..., None] * J, precision, x, raw, self.compared(part), loss)
         self._last = [*self._last, (x.copy(), part, there, J)][-_CACHED:]
         return there
 
-    def loss(self, x: np.ndarray, part: Part) -> float:
+    def loss(self, x: np.ndarray, part: Part | None = None) -> float:
         """Return the loss at ``x (P,)``, with initial states linearised there."""
-        return float(self.losses(x[None], x, part)[0])
+        return float(self.losses(np.asarray(x, np.float64)[None], x, part)[0])
 
-    def losses(self, candidates: np.ndarray, middle: np.ndarray, part: Part) -> np.ndarray:
+    def losses(self, candidates: np.ndarray, middle: np.ndarray, part: Part | None = None) -> np.ndarray:
         """Return the loss of each candidate ``(N, P)``, with initial states linearised at ``middle (P,)``."""
+        candidates, middle, part = np.asarray(candidates), np.asarray(middle, np.float64), part or self.part()
         raw = self._raw(candidates, self._fitted_states(middle, part), part)
-        rows = zip(robust(raw, self._config.reach)[0], candidates, strict=True)
+        rows = zip(robust(raw, self.config.reach)[0], candidates, strict=True)
         return np.array([self._loss(r, self._prior(x), part) for r, x in rows])
 
     def near(self, x: np.ndarray, part: Part, slopes: int | None = None) -> Nearby:
@@ -246,36 +275,45 @@ class Residuals:
             return np.concatenate([self._raw(y[None], states, part)[0].reshape(-1), self._prior(y)])
 
         def slope(y: np.ndarray) -> np.ndarray:
-            sign = np.where(y + self._step > self._table.high, -1.0, 1.0)
+            sign = np.where(y + self._step > self.table.high, -1.0, 1.0)
             groups = self._step_groups.members(np.flatnonzero(part.present).tolist())
             moved = self._moved(y, groups, sign)
             raw = self._raw(np.concatenate([y[None], moved]), states, part)
             J = self._step_groups.spread(raw[1:] - raw[0], groups, len(y)) / (sign * self._step)
             return np.concatenate([J.reshape(-1, len(y)), self._prior_slope(y)])
 
-        return Nearby(value, slope, self._table.span, self._known_nearby(x, part), slopes)
+        return Nearby(value, slope, self.table.span, self._known_nearby(x, part), slopes)
 
-    def predict(
+    def predict(self, values: Mapping[str, Any], segments: np.ndarray, fit_s: np.ndarray) -> np.ndarray:
+        """Return the residuals of ``simulated``."""
+        return self.simulated(values, segments, fit_s)[0]
+
+    def simulated(
         self, values: Mapping[str, Any], segments: np.ndarray, fit_s: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return residuals ``(R, K, F)`` of segments with states fitted to their first parts, and the states.
+        """Return the residuals of segments whose initial states are fitted to their first parts, and these states.
 
         Args:
-            values: Parameters by name, ``(R, ...)``.
+            values: Parameters by name, ``(R, ...)``: each segment with its own.
+            segments: Shape ``(R,)``: numbers of the segments.
             fit_s: Shape ``(R,)``: lengths of the first parts [s].
+
+        Returns:
+            Residuals ``(R, K, F)``, and initial states ``(R, 2 * channels)``: positions, then velocities.
         """
+        segments, fit_s = np.asarray(segments), np.asarray(fit_s)
         arrays, still = {n: np.asarray(v, np.float64) for n, v in values.items()}, np.zeros((len(segments), self._n))
         if self._free:
             fitted = self._best_states(arrays, segments, fit_s, _STATE_STEPS + 1)
             still, errors = fitted.shift, fitted.residuals
         else:
             errors = self.errors(arrays, segments, still)
-        return errors, self._rollouts.starts(arrays, segments, still, self._data)
+        return errors, self.rollouts.starts(arrays, segments, still, self.data)
 
     def robustly(self, points: np.ndarray, x: np.ndarray, part: Part) -> np.ndarray:
         """Return the robust residuals ``(N, S, K, F)`` at points ``(N, P)``; initial states are linearised at ``x``."""
         raw = self._raw(points, self._fitted_states(x, part, fresh=True), part)
-        return robust(raw, self._config.reach)[0]
+        return robust(raw, self.config.reach)[0]
 
     def liveliest(self, part: Part, most: int | None = None) -> Part:
         """Return the segments in which the channels move most, of each channel in turn.
@@ -286,13 +324,13 @@ class Residuals:
             most: Number of segments; default: as many as suffice for a start.
         """
         live = np.flatnonzero(part.live)
-        segments, reaches = self._train[live], []
-        counts = self._ts[segments] >= 0.0
-        for channel in self._rollouts.model.channels:
-            measured = channel.of(np.asarray(self._data.measured[channel.position])[segments])[:, : counts.shape[1]]
+        segments, reaches = self.train[live], []
+        counts = self.ts[segments] >= 0.0
+        for channel in self.channels:
+            measured = channel.of(np.asarray(self.data.measured[channel.position])[segments])[:, : counts.shape[1]]
             reaches.append(np.ptp(np.where(counts, measured, measured[:, :1]), axis=1))
         order = np.argsort(-np.array(reaches), axis=1).T.reshape(-1)  # the best of each channel, the second best, ...
-        recordings = np.asarray(self._data.recording)[segments]
+        recordings = np.asarray(self.data.recording)[segments]
         firsts = order[np.unique(recordings[order], return_index=True)[1]]
         count = most or max(_SEARCHED, 2 * len(reaches))
         turns = dict.fromkeys([*(firsts if len(firsts) <= count else ()), *order.tolist()])
@@ -302,23 +340,23 @@ class Residuals:
 
     def compared(self, part: Part) -> np.ndarray:
         """Return where measurements of live segments are compared, ``(S, K)``, bool."""
-        return (self._ts[self._train] >= 0.0) & part.live[:, None]
+        return (self.ts[self.train] >= 0.0) & part.live[:, None]
 
     def errors(self, values: Mapping[str, np.ndarray], segments: np.ndarray, shift: np.ndarray) -> np.ndarray:
         """Return ``Rollouts.errors`` without the padding of the programs."""
-        found = self._rollouts.errors(values, segments, shift, self._data)[:, : self._ts.shape[1]]
-        return np.where((self._ts[segments] >= 0.0)[..., None], found, 0.0)
+        found = self.rollouts.errors(values, segments, shift, self.data)[:, : self.ts.shape[1]]
+        return np.where((self.ts[segments] >= 0.0)[..., None], found, 0.0)
 
     # -- finite differences by parameters
 
     @property
     def _step(self) -> np.ndarray:
-        return self._config.difference * self._table.span
+        return self.config.difference * self.table.span
 
     def _moved(self, x: np.ndarray, groups: Sequence[Sequence[int]], sign: float | np.ndarray) -> np.ndarray:
         """Return points with each group of parameters moved by a step, within the bounds, ``(G, P)``."""
         moved = np.repeat(x[None], len(groups), axis=0)
-        to = np.clip(x + sign * self._step, self._table.low, self._table.high)
+        to = np.clip(x + sign * self._step, self.table.low, self.table.high)
         for row, group in zip(moved, groups, strict=True):
             row[group] = to[group]
         return moved
@@ -332,7 +370,7 @@ class Residuals:
         found = [(point, there, J) for point, known, there, J in self._last if covers(known)]
         if not found:
             return None
-        span = self._table.span
+        span = self.table.span
         point, there, J = min(found, key=lambda row: float(np.linalg.norm(((row[0] - x) / span)[part.present])))
         r = np.where(part.live[:, None, None], there.raw, 0.0).reshape(-1)
         J = np.where(part.live[:, None, None, None] & part.present, J, 0.0).reshape(-1, len(x))
@@ -340,36 +378,36 @@ class Residuals:
         return start, np.concatenate([r, self._prior(start)]), np.concatenate([J, self._prior_slope(start)])
 
     def _prior(self, x: np.ndarray) -> np.ndarray:
-        return self._table.prior_residuals(x)
+        return self.table.prior_residuals(x)
 
     def _prior_slope(self, x: np.ndarray) -> np.ndarray:
-        moves, h = np.eye(len(x)), 1e-3 * self._table.span
+        moves, h = np.eye(len(x)), 1e-3 * self.table.span
         rows = [(self._prior(x + h[i] * m) - self._prior(x - h[i] * m)) / (2.0 * h[i]) for i, m in enumerate(moves)]
         return np.stack(rows, axis=-1) if rows else np.zeros((0, 0))
 
     def _loss(self, r: np.ndarray, prior: np.ndarray, part: Part) -> float:
         count = max(int(self.compared(part).sum()) * r.shape[-1], 1)
-        every = max(int((self._ts[self._train] >= 0.0).sum()) * r.shape[-1], 1)
+        every = max(int((self.ts[self.train] >= 0.0).sum()) * r.shape[-1], 1)
         return 0.5 * (float(np.sum(r**2)) / count + float(np.sum(prior**2)) / every)
 
     # -- residuals at the best initial states
 
     def _raw(self, x: np.ndarray, states: _States | None, part: Part) -> np.ndarray:
         """Return the residuals without the robust loss at points ``(N, P)``, ``(N, S, K, F)``."""
-        return self._projected(self._table.decode(x, part.present), states, part)
+        return self._projected(self.table.decode(x, part.present), states, part)
 
     def _projected(self, values: Mapping[str, np.ndarray], states: _States | None, part: Part) -> np.ndarray:
         """Return residuals ``(N, S, K, F)`` at the best initial states near ``states``; 0 in segments left out."""
         # Roll out the live segments for all copies.
         live = np.flatnonzero(part.live)
-        segments, copies = self._train[live], len(next(iter(values.values())))
+        segments, copies = self.train[live], len(next(iter(values.values())))
         spread = {n: np.repeat(v, len(live), axis=0) for n, v in values.items()}
         shift = np.zeros((len(live), self._n)) if states is None else states.shift
         error = self.errors(spread, np.tile(segments, copies), np.tile(shift, (copies, 1)))
         error = error.reshape(copies, len(live), *error.shape[1:])
         # Move each initial state to its optimum along the linearisation.
         if states is not None:
-            counts = (self._ts[segments] >= 0.0)[..., None]
+            counts = (self.ts[segments] >= 0.0)[..., None]
             for row in error:
                 step = _next_shift(states._replace(residuals=row.copy()), counts) - shift
                 row += np.einsum("sn,snkf->skf", step, states.slope)
@@ -391,8 +429,8 @@ class Residuals:
         for point, is_fresh, states in self._last_states:
             if point == key and is_fresh >= fresh:
                 return states
-        segments = self._train[part.live]
-        values = {n: np.repeat(v, len(segments), axis=0) for n, v in self._table.decode(x[None], part.present).items()}
+        segments = self.train[part.live]
+        values = {n: np.repeat(v, len(segments), axis=0) for n, v in self.table.decode(x[None], part.present).items()}
         if fresh and (states := self._fitted_states(x, part)):
             states = states._replace(slope=self._slopes(values, segments, states.shift)[0])
         else:
@@ -411,7 +449,7 @@ class Residuals:
         # Linearise at the estimate from the log.
         still = np.zeros((len(segments), self._n))
         slope, errors = self._slopes(values, segments, still)
-        ts = self._ts[segments]
+        ts = self.ts[segments]
         counts = ((ts >= 0.0) & (ts <= fit_s[:, None]))[..., None]
         best = _States(still, slope, errors)
         least, candidate = _state_cost(best, counts), _next_shift(best, counts)
@@ -440,6 +478,31 @@ class Residuals:
         errors = np.moveaxis(errors.reshape(len(segments), len(moves), *errors.shape[1:]), 1, 0)
         changes = (errors[1 : len(groups) + 1] - errors[len(groups) + 1 :]) / (2.0 * _STATE_DIFFERENCE)
         return np.moveaxis(self._state_groups.spread(changes, groups, self._n), -1, 1), errors[0]
+
+    def with_readings(self, readings: Mapping[str, np.ndarray]) -> Problem:
+        """Return the same segments with other measurements, ``(E, K, ...)`` of each field; both share programs."""
+        other, measured = copy.copy(self), {f: np.array(rows) for f, rows in self.data.measured.items()}
+        for name, rows in readings.items():
+            measured[name][: rows.shape[0], : rows.shape[1]] = rows
+        measured = {name: jnp.asarray(rows) for name, rows in measured.items()}
+        other.readings, other.data = readings, self.data._replace(measured=measured)
+        other._forget()
+        return other
+
+    def recut(self, spans: Sequence[Span], length_s: float, ends_s: Sequence[float] | None = None) -> Problem:
+        """Return the same recordings cut into other segments; both problems share programs.
+
+        Args:
+            length_s: Length of a segment [s].
+            ends_s: Time in each segment after which measurements are not compared [s]; default: ``length_s``.
+        """
+        other = Problem(self.model, self._recordings, spans, length_s, self.config, like=self)
+        if ends_s is not None:
+            ends = dict(zip(spans, ends_s, strict=True))
+            until = np.array([ends[span] for span in other.spans])
+            other.ts = np.where(other.ts <= until[:, None], other.ts, -1.0)
+            other._forget()
+        return other
 
 
 def _next_shift(at: _States, counts: np.ndarray) -> np.ndarray:
@@ -471,78 +534,32 @@ def robust(raw: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
     return raw * share, 1.0 / (root * share)
 
 
-class Nearby:
-    """Residuals near a point, and their Jacobian, which is corrected after each step, and computed again if that fails.
-
-    Broyden's rank-one correction is exact along the last step (Math. Comp. 19, 1965).
+def thinned(problem: Problem, parts: np.ndarray, most: float) -> Problem:
+    """Return a problem with the segments with most motion of each part, if a Jacobian of all would take long.
 
     Args:
-        value: Residuals ``(N,)`` at a point ``(P,)``.
-        slope: Their Jacobian ``(N, P)``.
-        scale: Shape ``(P,)``: length of a step of each parameter that counts as much as one of another.
-        known: A point nearby, the residuals and the Jacobian there, which is corrected for the first point, too.
-        most: Most Jacobians that are computed; then each is corrected. Default: as many as needed.
+        parts: Shape ``(K, S)``, bool: which fitted segments are in each part, which keeps one at least.
+        most: Steps of single joints in a Jacobian.
     """
-
-    def __init__(
-        self,
-        value: Stacked,
-        slope: Stacked,
-        scale: np.ndarray | float = 1.0,
-        known: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
-        most: int | None = None,
-    ) -> None:
-        self._value, self._slope, self._scale = value, slope, scale
-        self._last: tuple[np.ndarray, np.ndarray] | None = None  # the point of the last evaluation, and the residuals
-        self._known, self._left, self._computed = known, np.inf if most is None else most, False
-
-    def residuals(self, y: np.ndarray) -> np.ndarray:
-        """Return the residuals at a point."""
-        if self._last is None or not np.array_equal(self._last[0], y):
-            self._last = (y.copy(), self._value(y))
-        return self._last[1]
-
-    def jacobian(self, y: np.ndarray) -> np.ndarray:
-        """Return the Jacobian at the point of a step, or at the point of the last one."""
-        if self._known is not None and np.array_equal(self._known[0], y):
-            return self._known[2]
-        r, J = self.residuals(y), None
-        if self._known is not None:
-            J = _updated(*self._known, y, r, self._scale, _TRUSTED if self._left > 0 else np.inf)
-        self._computed = J is None
-        self._known = (y.copy(), r, self._compute(y) if J is None else J)
-        return self._known[2]
-
-    def renew(self, y: np.ndarray) -> bool:
-        """Compute the Jacobian at the point of the last step; return False if that was done, or may not be."""
-        if self._computed or self._left <= 0:
-            return False
-        self._computed = True
-        self._known = (y.copy(), self.residuals(y), self._compute(y))
-        return True
-
-    def _compute(self, y: np.ndarray) -> np.ndarray:
-        self._left -= 1
-        return self._slope(y)
+    model, channels = problem.engine.model, len(problem.channels)
+    if model is None:
+        return problem
+    steps = problem.segment_s / float(model.opt.timestep) * (_BESIDE + int(model.nv)) * len(problem.table)
+    keep = max(int(most / steps), _FEWEST * channels, len(parts))
+    if keep >= len(problem.train):
+        return problem
+    live, (each, more) = np.zeros(len(problem.train), bool), divmod(keep, len(parts))
+    for k, touched in enumerate(parts):
+        live |= problem.liveliest(problem.part(problem.train[~touched]), each + (k < more)).live
+    return problem.recut([problem.spans[i] for i in problem.train[live]], problem.segment_s)
 
 
-def _updated(
-    point: np.ndarray,
-    before: np.ndarray,
-    J: np.ndarray,
-    y: np.ndarray,
-    r: np.ndarray,
-    scale: np.ndarray | float,
-    trusted: float,
-) -> np.ndarray | None:
-    """Return the corrected Jacobian after a step; None if the old one did not predict the step."""
-    step = y - point
-    expected = J @ step
-    missed = r - before - expected
-    direction = step / scale**2
-    length = float(step @ direction)
-    if length == 0.0:
-        return J
-    if not np.linalg.norm(missed) <= trusted * np.linalg.norm(expected):
-        return None
-    return J + np.outer(missed, direction / length)
+def of_recordings(problem: Problem) -> np.ndarray:
+    """Return which fitted segments are in each recording, ``(K, S)``, bool."""
+    recording = problem.recording[problem.train]
+    return recording == np.unique(recording)[:, None]
+
+
+def few_of(problem: Problem) -> Problem:
+    """Return a problem with the segments with most motion, of whichever recording, if all would take long."""
+    return thinned(problem, np.ones((1, len(problem.train)), bool), MOST_OF_SETS)

@@ -18,8 +18,7 @@ from sim2real.identification.fit import ROUGH, Fit, refine, with_terms
 from sim2real.identification.held_out import Fold, HeldOutPart, Statistics, on_held_out_parts, statistics
 from sim2real.identification.parameters import ParameterTable
 from sim2real.identification.predictions import labels
-from sim2real.identification.problem import MOST_OF_SETS, thinned
-from sim2real.identification.residuals import Linearised, Part
+from sim2real.identification.residuals import MOST_OF_SETS, Linearised, Part, thinned
 from sim2real.identification.uncertainty import above_noise
 
 ALIKE = 1.1
@@ -200,7 +199,7 @@ class TermSearch:
         new, own = table.of_terms(present) & ~table.of_terms(base.present), table.of_terms(base.present)
         shares = np.linspace(1.0, _INSIDE, _LEVELS + 1)[:, None]
         x = np.where(new, table.low + shares * table.span, base.x)
-        limited = problem.residuals.robustly(x, base.x, self._part(present)).reshape(_LEVELS + 1, -1)
+        limited = problem.robustly(x, base.x, self._part(present)).reshape(_LEVELS + 1, -1)
         limited = np.nan_to_num(limited, nan=_DIVERGED)
         basis = np.linalg.qr((at.jacobian * table.span).reshape(-1, len(table))[:, own])[0]
         errors = np.linalg.norm(limited - limited @ basis @ basis.T, axis=1)
@@ -229,9 +228,7 @@ class TermSearch:
     def _judged(self, trial: Trial) -> Trial:
         """Return a trial whose fit ended, with its errors by refits without each part."""
         # To the end, as each refit would have to descend that far, too.
-        further = refine(
-            self._problem, trial.x[None], self._part(trial.present), gain=self._problem.residuals.precision
-        )
+        further = refine(self._problem, trial.x[None], self._part(trial.present), gain=self._problem.precision)
         return replace(self._trial(trial.present, further.x, further.loss, refit=True), present=trial.present)
 
     def _trial(self, present: np.ndarray, x: np.ndarray, loss: float, refit: bool = False) -> Trial:
@@ -252,7 +249,7 @@ class TermSearch:
         steps = np.array([stats.step(table, present, np.arange(count) == g) for g in range(count)])
         points = table.within(x + np.concatenate([share * steps for share in _SHARES]))
         # Simulate all candidates at a time, and compare each on the segments of the other groups.
-        residuals = problem.residuals.robustly(points, x, self._part(present))
+        residuals = problem.robustly(points, x, self._part(present))
         squares = np.nan_to_num(np.sum(residuals**2, axis=(2, 3)), nan=np.inf)
         best = [
             min(range(k, len(points), count), key=lambda g, t=touched: float(squares[g][~t].sum()))

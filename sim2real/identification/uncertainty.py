@@ -15,8 +15,7 @@ import numpy as np
 from sim2real.artifacts.identification import Noise, Quantity
 from sim2real.errors import UsageError
 from sim2real.identification.parameters import ParameterTable
-from sim2real.identification.problem import Problem, of_recordings
-from sim2real.identification.residuals import Linearised
+from sim2real.identification.residuals import Linearised, Problem, of_recordings
 from sim2real.later import special
 
 VAGUE = 0.15

@@ -9,7 +9,7 @@ import pytest
 from sim2real.graph.episode import Episode, Steps
 from sim2real.identification.config import FitConfig
 from sim2real.identification.fit import refine, run_search
-from sim2real.identification.problem import Problem
+from sim2real.identification.residuals import Problem
 from sim2real.identification.segments import Span
 from sim2real.identification.uncertainty import from_linearised
 from sim2real.stages.config import RecordConfig

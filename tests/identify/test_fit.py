@@ -12,7 +12,7 @@ from sim2real.identification import fit as fitting
 from sim2real.identification.config import FitConfig
 from sim2real.identification.fit import fit, refine, remaining
 from sim2real.identification.parameters import ParameterTable
-from sim2real.identification.problem import Problem
+from sim2real.identification.residuals import Problem
 from sim2real.identification.segments import Span
 
 TABLE = Model.parameters.with_fixed({"square": 0.0})

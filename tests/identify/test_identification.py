@@ -8,7 +8,7 @@ import pytest
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.episode import Steps
 from sim2real.identification.predictions import errors, samples
-from sim2real.identification.problem import Problem
+from sim2real.identification.residuals import Problem
 from sim2real.identification.segments import Span
 
 SETTLE_S = 0.3

@@ -7,8 +7,8 @@ from scipy.optimize import least_squares
 
 from sim2real.artifacts.identification import Noise
 from sim2real.identification import predictions
-from sim2real.identification.problem import Problem
-from sim2real.identification.residuals import Groups, Nearby, robust
+from sim2real.identification.derivatives import Groups, Nearby
+from sim2real.identification.residuals import Problem, robust
 from sim2real.identification.segments import Span
 from sim2real.stages.deploy.replay import _of_noise
 
@@ -54,18 +54,18 @@ def test_errors_are_those_of_the_solution_by_hand_for_any_number_of_copies(model
     segment, shift = rng.integers(0, 9, 70), rng.normal(size=(70, 2))
     gain = rng.uniform(1.0, 2.0, 70)
     values = rows(OFF, 70) | {"gain": gain}
-    found = problem.residuals.errors(values, segment, shift)
+    found = problem.errors(values, segment, shift)
     starts = problem.rollouts.starts(values, segment, shift, problem.data)[:, 0]
     for i in (0, 31, 69):
         expected = by_hand(problem, segment[i], OFF | {"gain": gain[i]}, starts[i])
         np.testing.assert_allclose(found[i, :, 0], expected, atol=2e-3 * np.abs(expected).max())
-    alone = problem.residuals.errors({n: v[31:32] for n, v in values.items()}, segment[31:32], shift[31:32])
+    alone = problem.errors({n: v[31:32] for n, v in values.items()}, segment[31:32], shift[31:32])
     np.testing.assert_allclose(alone[0], found[31], atol=1e-3)
 
 
 def stacked(problem, x, part=None):
     """Return the robust residuals with each initial state solved for, all at once."""
-    there = problem.residuals.near(x, part or problem.part())
+    there = problem.near(x, part or problem.part())
     return robust(there.residuals(x), CONFIG.reach)[0]
 
 
@@ -124,7 +124,7 @@ def test_an_initial_state_is_that_of_least_squares(problem, fit_s):
     """A lag is linear in it: numpy solves for it at once, with a prior around the estimate."""
     values, segment = rows(TRUE | {"bias": BIAS + 0.01}, 1), np.array([2])
     found, start = problem.simulated(values, segment, np.array([fit_s]))
-    run = lambda u: problem.residuals.errors(values, segment, np.asarray(u, float)[None]).ravel()  # noqa: E731
+    run = lambda u: problem.errors(values, segment, np.asarray(u, float)[None]).ravel()  # noqa: E731
     r, ts = run([0.0, 0.0]), problem.ts[2]
     J = np.stack([run(np.eye(2)[i]) - r for i in range(2)], axis=1)
     counts = (ts >= 0) & (ts <= fit_s)

@@ -128,7 +128,7 @@ def effects(problem, values, factor=0.1):
     copies, every = len(names) + 1, np.arange(problem.segments)
     spread = {n: np.repeat(r, len(every)) for n, r in rows.items()}
     still = np.zeros((copies * len(every), 2 * len(problem.channels)))
-    residuals = problem.residuals.errors(spread, np.tile(every, copies), still)
+    residuals = problem.errors(spread, np.tile(every, copies), still)
     residuals = residuals.reshape(copies, len(every), *residuals.shape[1:])
     moved = np.abs(residuals[1:] - residuals[0]).reshape(len(names), -1).max(axis=1)
     return dict(zip(names, moved, strict=True))

@@ -10,7 +10,7 @@ from recorded_robots import RecordedRobotConformance, episode, predictions, publ
 from scipy.optimize import least_squares
 
 from sim2real.identification.fit import fit
-from sim2real.identification.problem import Problem
+from sim2real.identification.residuals import Problem
 from sim2real.identification.segments import Span
 from sim2real.stages.load import load_robot
 
@@ -116,7 +116,7 @@ def test_the_model_is_the_loop(synthetic):
     values, segment = {n: np.full(1, v) for n, v in TRUTH.items()}, np.array([0])
     estimated = problem.rollouts.starts(values, segment, np.zeros((1, 2)), problem.data)
     shift = (np.array([[encoder(TRUTH, 0.3), 0.0]]) - estimated) / problem.rollouts.prior
-    off = problem.residuals.errors(values, segment, shift)[0][problem.ts[0] >= 0, 0] * model.channels[0].position_sigma
+    off = problem.errors(values, segment, shift)[0][problem.ts[0] >= 0, 0] * model.channels[0].position_sigma
     assert len(off) > 380
     assert np.ptp(synthetic.exact[:400]) > 2.0
     assert rmse(off) < 0.002

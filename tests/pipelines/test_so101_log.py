@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from recorded_robots import RecordedRobotConformance, episode, predictions, public, rmse
 
-from sim2real.identification.problem import Problem
+from sim2real.identification.residuals import Problem
 from sim2real.identification.segments import Span
 from sim2real.stages.load import load_module, load_robot
 

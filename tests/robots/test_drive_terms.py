@@ -13,7 +13,7 @@ from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode, Steps
 from sim2real.identification.config import FitConfig
 from sim2real.identification.fit import refine
-from sim2real.identification.problem import Problem
+from sim2real.identification.residuals import Problem
 from sim2real.identification.segments import Span
 from sim2real.robots.model.drives import driven
 from sim2real.robots.model.parameters import (
@@ -160,7 +160,7 @@ def engines(tmp_path_factory):
 def played(problem, terms):
     values = {"kp": 9.0, "kd": 0.1, "frictionloss": 0.03, "delay": 0.0071, **terms}
     rows = {p.name: np.full(1, values.get(p.name, p.nominal)) for p in problem.table}
-    return 0.002 * problem.residuals.errors(rows, np.array([0]), np.array([[0.3, -1.0]]) / problem.rollouts.prior)[0]
+    return 0.002 * problem.errors(rows, np.array([0]), np.array([[0.3, -1.0]]) / problem.rollouts.prior)[0]
 
 
 @pytest.mark.night

@@ -11,7 +11,7 @@ from small_robot import SERVOS, SHEET, VALUES, PairRobot
 
 from sim2real.graph.episode import Episode, Steps
 from sim2real.identification.config import FitConfig
-from sim2real.identification.problem import Problem
+from sim2real.identification.residuals import Problem
 from sim2real.identification.segments import Span
 
 pytestmark = pytest.mark.night  # `make test` compares the engines in test_drive_terms.py
@@ -71,7 +71,7 @@ def played(problem, values, shift=(0.2, -0.1, 1.0, -2.0)):
     """Return the residuals of both segments [rad]."""
     rows = {p.name: np.full(2, values.get(p.name, p.nominal)) for p in problem.table}
     shifts = np.repeat(np.array(shift)[None] / problem.rollouts.prior, 2, axis=0)
-    return problem.residuals.errors(rows, np.arange(2), shifts) * np.array([s for _, s, _ in problem.fields])
+    return problem.errors(rows, np.arange(2), shifts) * np.array([s for _, s, _ in problem.fields])
 
 
 delays = st.floats(0.0, MAX_DELAY_S)

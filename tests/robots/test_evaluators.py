@@ -8,7 +8,7 @@ from small_robot import VALUES
 from test_engines import MAX_DELAY_S, SEGMENT_S, converged_robot, pair_log
 
 from sim2real.identification.config import FitConfig
-from sim2real.identification.problem import Problem
+from sim2real.identification.residuals import Problem
 from sim2real.identification.segments import Span
 
 pytestmark = pytest.mark.night  # MJX compiles for two minutes
@@ -22,7 +22,7 @@ def shown_by(problem):
     every, rng = np.arange(problem.segments), np.random.default_rng(0)
     values = {p.name: np.full(len(every), TRUTH.get(p.name, p.nominal)) for p in problem.table}
     shift = np.repeat(np.array(SHIFT)[None] / problem.rollouts.prior, len(every), axis=0)
-    errors = problem.residuals.errors(values, every, shift)
+    errors = problem.errors(values, every, shift)
     read = {f: np.array(rows, np.float64) for f, rows in problem.readings.items()}
     for i, (field, sigma, _) in enumerate(problem.fields):
         channel = problem.channels[i // 2]

@@ -19,7 +19,7 @@ from sim2real.identification.export.mjcf import Late, late_mjcf
 from sim2real.identification.export.terms import find_terms
 from sim2real.identification.model import Channel
 from sim2real.identification.parameters import Parameter
-from sim2real.identification.problem import Problem
+from sim2real.identification.residuals import Problem
 from sim2real.identification.segments import Span
 from sim2real.robots.identified import LoggedRobot
 from sim2real.worlds.mjx import MjxWorld
@@ -145,7 +145,7 @@ def predicted(robot, values, field, commands, shape=(1,)):
     config = FitConfig(max_delay_s=0.03, initial_state="rest")
     problem = Problem(robot.identifiable(0.03), [episode], [Span(0, 0.0)], SEGMENT_S, config)
     rows = {n: np.full(1, v) for n, v in values.items()}
-    error = problem.residuals.errors(rows, np.array([0]), np.zeros((1, 2)))[0]
+    error = problem.errors(rows, np.array([0]), np.zeros((1, 2)))[0]
     ts = problem.ts[0]
     counted, error = ts >= 0, error[: len(ts)]
     assert counted.sum() > 80

@@ -8,7 +8,7 @@ from small_robot import VALUES, play_on_c
 
 from sim2real.graph.episode import Episode, Steps
 from sim2real.identification.config import FitConfig
-from sim2real.identification.problem import Problem
+from sim2real.identification.residuals import Problem
 from sim2real.identification.segments import Span
 
 MAX_DELAY_S, PERIOD_S, SEGMENT_S = 0.03, 0.02, 0.6
@@ -57,7 +57,7 @@ def residuals(pair, episode):
     every, errors = np.arange(len(spans)), {}
     for name, gain in (("true", TRUTH["gain"]), ("wrong", 1.3 * TRUTH["gain"])):
         values = {n: np.full(len(every), v) for n, v in (TRUTH | {"gain": gain}).items()}
-        errors[name] = problem.residuals.errors(values, every, np.zeros((len(every), 4)))
+        errors[name] = problem.errors(values, every, np.zeros((len(every), 4)))
     return SimpleNamespace(problem=problem, config=config, ts=problem.ts, **errors)
 
 

@@ -19,7 +19,7 @@ from sim2real.identification.config import FitConfig
 from sim2real.identification.export.card import json_document
 from sim2real.identification.export.terms import Delays
 from sim2real.identification.predictions import replays
-from sim2real.identification.problem import Problem
+from sim2real.identification.residuals import Problem
 from sim2real.identification.segments import Span
 from sim2real.log import read_log
 from sim2real.robots.model.parameters import ParameterPattern

@@ -9,7 +9,7 @@ from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.episode import Episode
 from sim2real.identification.config import FitConfig
 from sim2real.identification.fit import fit
-from sim2real.identification.problem import Problem
+from sim2real.identification.residuals import Problem
 from sim2real.identification.segments import Span
 from sim2real.log.importing.names import meaning
 from sim2real.robots.model.parameters import ParameterPattern

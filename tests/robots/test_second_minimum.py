@@ -5,7 +5,7 @@ import pytest
 
 from sim2real.identification.config import FitConfig
 from sim2real.identification.fit import ROUGH, _at_other_delays, refine
-from sim2real.identification.problem import Problem
+from sim2real.identification.residuals import Problem
 from sim2real.identification.segments import Span
 from sim2real.stages.config import RecordConfig
 from sim2real.stages.load import load_robot

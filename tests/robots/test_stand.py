@@ -17,7 +17,7 @@ from sim2real.emulation.truth import read_truth
 from sim2real.errors import OtherMotion
 from sim2real.identification.config import FitConfig
 from sim2real.identification.predictions import labels
-from sim2real.identification.problem import Problem
+from sim2real.identification.residuals import Problem
 from sim2real.identification.segments import Span
 from sim2real.robots.walking.twin import twin_of
 from sim2real.stages.load import defaults_of

@@ -19,7 +19,7 @@ from sim2real.identification import predictions as prediction
 from sim2real.identification.fit import Fit as ModelFit
 from sim2real.identification.fit import as_numbers
 from sim2real.identification.fit import fit as fit_model
-from sim2real.identification.problem import Problem
+from sim2real.identification.residuals import Problem
 from sim2real.identification.segments import Span
 from sim2real.stages.config import IdentifyConfig
 from sim2real.stages.identify import fitting

@@ -464,7 +464,7 @@ def determine(
     model: IdentifiableModel, episodes: Sequence[Episode], config: IdentifyConfig, parameters: ParameterTable
 ) -> Checked:
     """Return which parameters recordings determine: their residuals are simulated once, at the nominal values."""
-    from sim2real.identification.problem import Problem  # imports JAX
+    from sim2real.identification.residuals import Problem  # imports JAX
     from sim2real.identification.uncertainty import determined as what_is_determined
 
     spans, length_s = cut_segments(episodes, config)

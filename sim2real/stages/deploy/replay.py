@@ -17,7 +17,7 @@ from sim2real.identification.held_out import MOVES
 from sim2real.identification.model import ChecksLogs, IdentifiableModel
 from sim2real.identification.parameters import ParameterTable
 from sim2real.identification.predictions import NOISE, positions
-from sim2real.identification.problem import Problem
+from sim2real.identification.residuals import Problem
 from sim2real.identification.segments import Span
 from sim2real.robots.robot import RecordedRobot
 from sim2real.stages.identify.config import IdentifyConfig
@@ -47,7 +47,7 @@ def tested(
     posterior = identification.needed_posterior()
     # Test each parameter, and fit all of them to this log.
     drifted, x = drift_test.drift(problem, posterior, identification.widening or 1.0, robot.causes)
-    z = refine(problem, problem.table.within(x)[None], gain=problem.residuals.precision).x
+    z = refine(problem, problem.table.within(x)[None], gain=problem.precision).x
     refitted = {n: float(np.ravel(v)[0]) for n, v in problem.table.decode(z).items()}
     nominal = {p.name: p.nominal for p in problem.model.parameters}
     # Predict the segments with each model.

@@ -10,8 +10,7 @@ from sim2real.artifacts.identification import TriedTerm
 from sim2real.identification.fit import Fit, OnProgress, as_numbers, fit
 from sim2real.identification.held_out import MOST, Fold, HeldOutPart, folds_of, leave_out
 from sim2real.identification.parameters import ParameterTable
-from sim2real.identification.problem import Problem
-from sim2real.identification.residuals import Linearised
+from sim2real.identification.residuals import Linearised, Problem
 from sim2real.identification.terms import Selection, TermSearch, gains
 from sim2real.identification.uncertainty import ABSENT, NOT_REACHED, Determined, Uncertainty, above_noise, between_parts
 from sim2real.identification.uncertainty import determined as what_is_determined

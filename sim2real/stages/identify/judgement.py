@@ -30,8 +30,7 @@ from sim2real.identification.expected import wider_for, with_expected_errors
 from sim2real.identification.fit import ROUGH, Fit, as_numbers, refine, refit
 from sim2real.identification.held_out import HeldOutPart
 from sim2real.identification.predictions import Position, positions, replays, ringing, worst_second
-from sim2real.identification.problem import Problem, few_of
-from sim2real.identification.residuals import Linearised
+from sim2real.identification.residuals import Linearised, Problem, few_of
 from sim2real.identification.segments import Span, extents
 from sim2real.identification.terms import MENDS
 from sim2real.identification.uncertainty import (

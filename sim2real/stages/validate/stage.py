@@ -28,7 +28,7 @@ from sim2real.identification.expected import wider_for
 from sim2real.identification.held_out import moving
 from sim2real.identification.model import IdentifiableModel, measured_channels
 from sim2real.identification.predictions import positions
-from sim2real.identification.problem import Problem
+from sim2real.identification.residuals import Problem
 from sim2real.identification.segments import Span, check_log, extents
 from sim2real.identification.verdict import ACCEPTED, scores
 from sim2real.robots.robot import RecordedRobot, Robot
