@@ -28,8 +28,7 @@ if TYPE_CHECKING:
     from sim2real.hardware.dynamixel import DynamixelServos
     from sim2real.hardware.joint import Joint
     from sim2real.hardware.safety.following import Following
-    from sim2real.hardware.safety.gate import GateConfig
-    from sim2real.hardware.safety.limits import GateLimits
+    from sim2real.hardware.safety.gate import GateConfig, GateLimits
     from sim2real.hardware.safety.rig import Rig
 
 SERVO_ID = 1

@@ -10,12 +10,11 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from enum import Enum, IntEnum
+from enum import IntEnum
 from typing import Final, Literal, Self, TypeAlias
 
 import numpy as np
 
-from sim2real.errors import UsageError
 from sim2real.hardware.clock import SYSTEM_CLOCK, Clock
 from sim2real.hardware.safety.following import Following
 
@@ -63,7 +62,7 @@ class Reading:
     Args:
         position_rad: Shape (n,) [rad], from the zero of the device's settings.
         velocity_rad_s: Shape (n,) [rad/s].
-        load: Shape (n,), in the unit that the device's `measures` names; NaN if it does not name `load`.
+        load: Shape (n,), in the device's `load_unit`; NaN if it does not measure a load.
         transaction: The times of the instruction and its answer. If the device sends its state without a request,
             `t_sent_ns` is the time of the sample.
         parts: Name -> values of the other parts, as the device's `parts` declares them.
@@ -137,7 +136,6 @@ class CommandKind:
 
 
 VOLTAGE: Final = CommandKind("volts", "V", "zero")
-DUTY: Final = CommandKind("duties", "1", "zero")
 POSITION: Final = CommandKind("positions", "rad", "hold")
 
 
@@ -149,49 +147,6 @@ class OperatingMode(IntEnum):
     POSITION = 3
     EXTENDED_POSITION = 4
     PWM = 16
-
-
-class Alone(Enum):
-    """Reaction of a motor to the silence of its host."""
-
-    TORQUE_OFF = "takes its torque off"
-    STOPS = "stops"
-    GOES_ON = "goes on as commanded last"
-    DAMPS = "damps its joint"
-
-
-@dataclass(frozen=True)
-class WithoutHost:
-    """Reaction of motors to the death of their host; `str` returns it as a sentence.
-
-    Args:
-        after_s: Time from the last instruction to the reaction [s]; inf: never.
-        source: Where that is documented, or who measured it.
-        why: The reason why there is no reaction, or "".
-    """
-
-    model: str
-    motors: tuple[str, ...]
-    does: Alone
-    after_s: float
-    source: str
-    why: str = ""
-
-    @property
-    def words(self) -> str:
-        """The reaction as a phrase, without the names of the motors."""
-        if self.does is Alone.TORQUE_OFF:
-            return f"takes its torque off after {self.after_s:g} s"
-        if self.does is Alone.STOPS:
-            return f"stops after {self.after_s:g} s, torque stays on"
-        if self.does is Alone.DAMPS:
-            return f"damps its joint after {self.after_s:g} s"
-        if math.isfinite(self.after_s):
-            return f"notices after {self.after_s:g} s, but {self.does.value}"
-        return self.does.value + (f" ({self.why})" if self.why else "")
-
-    def __str__(self) -> str:
-        return f"{self.model} ({', '.join(self.motors)}) {self.words}"
 
 
 class Device(ABC):
@@ -235,9 +190,9 @@ class Device(ABC):
         """Longest time without an instruction while torque is on, after which it is taken off [s]; 0: unlimited."""
 
     @property
-    def measures(self) -> Mapping[str, str]:
-        """Quantity -> unit of a reading; ``position`` [rad] and ``velocity`` [rad/s] always."""
-        return {"position": "rad", "velocity": "rad/s", "load": "1"}
+    def load_unit(self) -> str:
+        """Unit of a reading's load; default: a share of the largest."""
+        return "1"
 
     @property
     def parts(self) -> Mapping[str, ReadingPart]:
@@ -262,8 +217,8 @@ class Device(ABC):
         """
 
     @abstractmethod
-    def without_host(self) -> tuple[WithoutHost, ...]:
-        """Return the reaction of the motors to the death of this process, each motor in one entry."""
+    def without_host(self) -> tuple[str, ...]:
+        """Return the reaction of the motors to the death of this process, as phrases: MODEL (MOTORS) goes on, ..."""
 
     def facts(self) -> Mapping[str, Mapping[str, str]]:
         """Return ``firmware``, ``voltage`` and ``temperature`` of each motor, as text, read from the open device.
@@ -288,20 +243,19 @@ class Device(ABC):
         return None
 
     @abstractmethod
-    def enable(self) -> None:
+    def enable(self) -> np.ndarray:
         """Write the settings that motors lose without power, and switch the torque on; the motors stay at rest.
 
         Before torque goes on, a watcher outside of this process starts: it takes the torque off when this process dies,
         or is silent for longer than `silence_s`.
 
+        Returns:
+            The command that the motors follow from now on, ``(n,)`` or ``(n, k)``.
+
         Raises:
             SafetyStop: `make_safe` was called before, or the torque has been taken off from outside.
             HardwareLost: A motor does not answer, or the watcher does not start.
         """
-
-    @abstractmethod
-    def rest(self) -> np.ndarray:
-        """Return the command that the motors follow right after `enable`, ``(n,)`` or ``(n, k)``."""
 
     @abstractmethod
     def measure(self) -> Reading:
@@ -326,25 +280,6 @@ class Device(ABC):
             SafetyStop: A value is not finite or too large, or a motor has stopped itself.
             HardwareLost: The device is silent.
         """
-
-    def soften(self, command: np.ndarray, left: float) -> np.ndarray:
-        """Return a command of a soft stop.
-
-        Default: a command that is zero when stale fades, and one that is held stays. Columns need another method.
-
-        Args:
-            command: The last command before the soft stop; the newest one if it fades to zero.
-            left: Share of the fade that is left, from 1 to 0.
-
-        Raises:
-            UsageError: Commands have columns, and the class has no method of its own.
-        """
-        if self.commanded.columns:
-            raise UsageError(
-                f"{type(self).__name__} commands columns and has no soft stop",
-                hint="define soften: the columns' way to rest",
-            )
-        return command if self.commanded.stale == "hold" else command * left
 
     @abstractmethod
     def check(self) -> None:

@@ -106,7 +106,7 @@ class Mounting:
             power = _power(unit, what)
             return (1.0 if unit in _UNDIRECTED else direction) * gear**power
 
-        self._load = factor(device.measures.get("load", "1"), "loads")
+        self._load = factor(device.load_unit, "loads")
         self._factor = np.stack([factor(unit, kind.name) for unit in kind.units], axis=-1)
         self._offset = np.stack([self._zero * (unit == "rad") for unit in kind.units], axis=-1)
         if not kind.columns:

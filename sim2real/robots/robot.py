@@ -56,8 +56,7 @@ if TYPE_CHECKING:
     from sim2real.hardware.device import Device, Reading
     from sim2real.hardware.joint import Joint
     from sim2real.hardware.safety.following import Following
-    from sim2real.hardware.safety.gate import GateConfig
-    from sim2real.hardware.safety.limits import GateLimits
+    from sim2real.hardware.safety.gate import GateConfig, GateLimits
     from sim2real.hardware.safety.rig import Rig
     from sim2real.log.importing.mapping import ImportMapping
     from sim2real.stages.config import Defaults

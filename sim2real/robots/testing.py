@@ -20,7 +20,7 @@ from sim2real.graph.base import GraphState
 from sim2real.graph.episode import named_leaves
 from sim2real.graph.schedule import draw
 from sim2real.hardware.device import OperatingMode
-from sim2real.hardware.safety.limits import GateLimits
+from sim2real.hardware.safety.gate import GateLimits
 from sim2real.identification.model import IdentifiableModel
 from sim2real.robots.loop import ACTUATOR, AGENT, SENSOR, WORLD
 from sim2real.robots.robot import RecordedRobot, Robot, as_columns, as_sent, checked

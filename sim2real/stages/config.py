@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import Any
 
-from sim2real.hardware.safety.limits import GateLimits as GateLimits
+from sim2real.hardware.safety.gate import GateLimits as GateLimits
 from sim2real.stages.deploy.config import DeployConfig as DeployConfig
 from sim2real.stages.identify.config import IdentifyConfig as IdentifyConfig
 from sim2real.stages.session.config import RecordConfig as RecordConfig

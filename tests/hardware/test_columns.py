@@ -71,7 +71,7 @@ def test_a_value_that_is_no_number_is_named_by_motor_and_column():
 
 
 def test_columns_are_converted_between_joints_and_motors():
-    device = SimpleNamespace(motors=("a", "b"), commanded=KIND, measures={"load": "N m"})
+    device = SimpleNamespace(motors=("a", "b"), commanded=KIND, load_unit="N m")
     mounting = Mounting([Joint("a", zero_rad=0.1, direction=-1, gear=2.0), Joint("b")], device)
     command = np.array(SENT)
     motors = mounting.to_motors(command)

@@ -6,17 +6,14 @@ import numpy as np
 import pytest
 from virtual_bus import IdleDevice
 
-from sim2real.errors import SafetyStop, UsageError
+from sim2real.errors import SafetyStop
 from sim2real.hardware.device import (
-    Alone,
     CommandColumn,
     CommandKind,
     Counters,
-    Device,
     Reading,
     ReadingPart,
     Transaction,
-    WithoutHost,
 )
 from sim2real.hardware.safety.gate import GateConfig
 from sim2real.hardware.safety.rig import Rig
@@ -38,7 +35,7 @@ class Legs(IdleDevice):
     motors = ("FR_hip", "FL_hip")
     commanded = CommandKind.of_columns("controllers", *COLUMNS)
     silence_s, counters = 0.0, Counters()
-    measures = {"position": "rad", "velocity": "rad/s", "load": "N m"}  # noqa: RUF012
+    load_unit = "N m"
     parts = {"quaternion": ReadingPart("1", (4,), norm=(0.9, 1.1)), "gyro": ReadingPart("rad/s", (3,), -50.0, 50.0)}  # noqa: RUF012
 
     def __init__(self, period_s=0.002):
@@ -46,21 +43,17 @@ class Legs(IdleDevice):
         self.position, self.speed, self.quaternion = np.array([0.2, -0.1]), np.zeros(N), np.array([1.0, 0, 0, 0])
 
     def without_host(self):
-        return (WithoutHost("leg", self.motors, Alone.DAMPS, 0.5, "this test"),)
+        return ()
 
     def reach(self):
         return LOW, HIGH
 
-    def rest(self):
+    def enable(self):
         return np.stack([self.position, *np.zeros((4, N))], axis=-1)
 
     def command(self, values):
         self.heard.append(np.array(values))
         return Transaction(self.clock.now_ns(), 0, 0, 0)
-
-    def soften(self, command, left):
-        q, _, kp, _, _ = command.T
-        return np.stack([q, 0.0 * q, kp * left, np.full(N, DAMPING), 0.0 * q], axis=-1)
 
     def measure(self):
         tick = int((1e-9 * self.clock.now_ns() - self.begin_s) / self.period_s)
@@ -83,7 +76,7 @@ def standing(kp=40.0):
     return np.tile([0.0, 0.0, kp, 1.0, 0.0], (N, 1))
 
 
-def test_a_soft_stop_is_the_device_s_own():
+def test_a_soft_stop_fades_each_column_to_what_replaces_a_stale_one():
     device = Legs()
     with Rig(device, gate()) as rig:
         rig.start()
@@ -95,15 +88,11 @@ def test_a_soft_stop_is_the_device_s_own():
             rig.measure()
             rig.clock.sleep(0.005)
         assert rig.eased
-    gains = np.array([sent[:, 2] for sent in device.heard if sent[0, 3] == DAMPING and sent[0, 2] > 0.0])
-    assert len(gains) > 3
-    assert np.all(np.diff(gains, axis=0) <= 0.0)
-    assert device.heard[-1][0, 3] == DAMPING
-
-
-def test_columns_without_a_soft_stop_are_refused_in_words():
-    with pytest.raises(UsageError, match="has no soft stop"):
-        Device.soften(Legs(), standing(), 0.5)
+    heard = np.array([sent for sent in device.heard if sent[0, 2] > 0.0])
+    assert len({*heard[:, 0, 2].tolist()}) > 3
+    assert np.all(np.diff(heard[:, :, 2], axis=0) <= 0.0)
+    assert np.all(np.diff(heard[:, :, 3], axis=0) >= 0.0)
+    np.testing.assert_allclose(device.heard[-1][:, 1:], np.tile([0.0, 0.0, DAMPING, 0.0], (N, 1)), atol=1e-9)
 
 
 def test_a_sample_that_was_read_before_keeps_its_stamp_and_is_not_checked_again():
@@ -113,7 +102,6 @@ def test_a_sample_that_was_read_before_keeps_its_stamp_and_is_not_checked_again(
         first = rig.measure()
         device.quaternion = np.zeros(4)
         assert rig.measure().transaction.t_sent_ns == first.transaction.t_sent_ns
-        assert rig.repeats == 1
         # A device that repeats one sample for ever has stopped measuring.
         rig.clock.sleep(0.1)
         with pytest.raises(SafetyStop, match="newest measurement"):

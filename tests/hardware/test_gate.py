@@ -4,8 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sim2real.errors import SafetyStop, UsageError
-from sim2real.hardware.safety.gate import GateConfig, SafetyGate
-from sim2real.hardware.safety.limits import GateLimits
+from sim2real.hardware.safety.gate import GateConfig, GateLimits, SafetyGate
 
 
 def test_clamping_symmetric_and_not():

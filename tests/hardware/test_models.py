@@ -3,18 +3,17 @@
 from pathlib import Path
 
 from sim2real.hardware import dynamixel, feetech
-from sim2real.hardware.device import Alone
 
 GUIDE = Path(__file__).parents[2] / "docs" / "guides" / "safety.md"
 
 
 def test_the_guide_has_the_table():
     for model in [*dynamixel.MODELS.values(), *feetech.MODELS.values()]:
-        words = model.without_host(0.1).words.replace("after 0.1 s", "after `servo_watchdog_s`")
+        words = model.without_host(0.1).replace("after 0.1 s", "after `servo_watchdog_s`")
         assert f"| {model.name} | {words} | {model.source} |" in GUIDE.read_text()
 
 
 def test_of_an_unknown_model_the_worst_is_assumed():
-    assert dynamixel.model(99).without_host(0.1).does is Alone.GOES_ON
+    assert "goes on" in dynamixel.model(99).without_host(0.1)
     assert dynamixel.model(99).name == "model 99"
-    assert dynamixel.model(1060).without_host(0.0).words == "goes on as commanded last (its bus watchdog is off)"
+    assert dynamixel.model(1060).without_host(0.0) == "goes on as commanded last (its bus watchdog is off)"

@@ -1,7 +1,5 @@
 """Mountings of joints: whatever zero, direction and gear are between joint and motor, joints move and stop the same."""
 
-from types import MappingProxyType
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,7 +8,7 @@ from virtual_bus import IdleDevice
 
 from sim2real.emulation.plant import MountedPlant
 from sim2real.errors import SafetyStop, UsageError
-from sim2real.hardware.device import DUTY, POSITION, VOLTAGE, CommandKind, Counters, OperatingMode, Reading, Transaction
+from sim2real.hardware.device import POSITION, VOLTAGE, CommandKind, Counters, OperatingMode, Reading, Transaction
 from sim2real.hardware.joint import Joint, Mounting
 from sim2real.hardware.safety.gate import GateConfig
 from sim2real.hardware.safety.rig import Rig
@@ -18,6 +16,7 @@ from sim2real.hardware.safety.rig import Rig
 STEP_S, N = 0.02, 2
 PLAIN = ((0.0, 1, 1.0),) * N
 VELOCITY, TORQUE = CommandKind("velocities", "rad/s", "zero"), CommandKind("torques", "N m", "zero")
+DUTY = CommandKind("duties", "1", "zero")
 KINDS = (POSITION, VOLTAGE, DUTY, VELOCITY, TORQUE)
 
 mounting = st.tuples(st.floats(-2.0, 2.0), st.sampled_from([1, -1]), st.sampled_from([0.5, 1.0, 2.0, 3.0, 7.3]))
@@ -32,7 +31,6 @@ class Bench(IdleDevice):
 
     motors = tuple(f"motor {i}" for i in range(N))
     commanded, silence_s, counters = POSITION, 0.0, Counters()
-    measures = MappingProxyType({"position": "rad", "velocity": "rad/s", "load": "1"})
 
     def __init__(self, kind, rows, reach=(-50.0, 50.0), leap_at=None):
         self.commanded, self.zero, self.direction, self.gear = kind, *np.array(rows, float).T
@@ -61,7 +59,7 @@ class Bench(IdleDevice):
         ends = [self.to_motor(np.full(N, end)) for end in self.joint_reach]
         return np.minimum(*ends), np.maximum(*ends)
 
-    def rest(self):
+    def enable(self):
         return self.to_motor(self.joint if self.commanded is POSITION else np.zeros(N))
 
     def command(self, values):
@@ -173,7 +171,7 @@ def test_a_stale_command_is_held_or_zero_at_the_joints():
 
 def test_torques_and_loads_in_newton_metres_grow_by_the_gear():
     class Torques(Bench):
-        measures = MappingProxyType({**Bench.measures, "load": "N m"})
+        load_unit = "N m"
 
     device = Torques(TORQUE, PLAIN)
     mounting = Mounting(as_joints([(0.5, -1, 4.0), (0.0, 1, 0.5)]), device)

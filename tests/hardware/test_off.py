@@ -248,7 +248,7 @@ class Plain(IdleDevice):
     def reach(self):
         return np.full(1, -10.0), np.full(1, 10.0)
 
-    def rest(self):
+    def enable(self):
         return np.zeros(1)
 
     def without_host(self): ...

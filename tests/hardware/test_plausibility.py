@@ -8,7 +8,6 @@ import pytest
 from sim2real.errors import SafetyStop, UsageError
 from sim2real.hardware.safety.gate import GateConfig
 from sim2real.hardware.safety.plausibility import Plausibility
-from sim2real.hardware.safety.rig import _pushed
 
 PERIOD_S = 0.02
 STILL = np.array([0.5, -0.25])
@@ -98,7 +97,7 @@ def test_a_swinging_joint_that_a_host_finds_where_it_was_after_a_pause_is_not_fr
 )
 def test_a_joint_is_pushed_by_a_command_that_is_not_the_one_of_rest(stale, sent, pushed):
     limit = ([-1.0, 0.0, 0.0], [1.0, 50.0, 5.0]) if isinstance(stale, tuple) else 1.0
-    assert _pushed(np.array(sent), GateConfig(limit, stale=stale)).tolist() == pushed
+    assert GateConfig(limit, stale=stale).pushes(np.array(sent)).tolist() == pushed
 
 
 @pytest.mark.parametrize(

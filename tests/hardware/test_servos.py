@@ -14,7 +14,7 @@ from sim2real.hardware import feetech as sts
 from sim2real.hardware.bus.packets import Instruction
 from sim2real.hardware.bus.port import BusConfig
 from sim2real.hardware.bus.servos import ServoJoint as Joint
-from sim2real.hardware.device import Alone, OperatingMode
+from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.dynamixel import PROTOCOL, DynamixelServos, PositionDrive, VoltageDrive
 from sim2real.hardware.feetech import StsDrive, StsServos
 from sim2real.hardware.registry import load_device
@@ -76,8 +76,7 @@ def test_a_direction_and_a_zero():
     expected = np.array([-0.5, -0.8, 0.3 - 100 * COUNT_RAD])
     with feetech(STS.robot(), joints, StsDrive(p_gain=254)) as device:
         assert device.measure().position_rad == pytest.approx(expected, abs=COUNT_RAD)
-        device.enable()
-        assert device.rest() == pytest.approx(expected, abs=COUNT_RAD)
+        assert device.enable() == pytest.approx(expected, abs=COUNT_RAD)
         goal = expected + np.array([0.2, 0.1, -0.1])
         device.command(goal)
         device.clock.sleep(0.6)
@@ -388,10 +387,9 @@ def test_facts_for_a_log_are_those_of_the_registers():
 def test_what_they_do_without_a_host_is_said():
     with feetech(STS.robot()) as device:
         (said,) = device.without_host()
-    assert (said.does, said.after_s, said.motors) == (Alone.GOES_ON, math.inf, ("servo 1", "servo 2", "servo 3"))
-    assert str(said) == "STS3215 (servo 1, servo 2, servo 3) goes on as commanded last (it has no bus watchdog)"
+    assert said == "STS3215 (servo 1, servo 2, servo 3) goes on as commanded last (it has no bus watchdog)"
     with angles(VOLTS.robot(settings={"model_number": 1200}), VoltageDrive(5.0), silence_s=0.1) as device:
-        assert str(device.without_host()[0]).endswith("notices after 0.1 s, but goes on as commanded last")
+        assert device.without_host()[0].endswith("notices after 0.1 s, but goes on as commanded last")
 
 
 def test_servos_by_the_devices_name():

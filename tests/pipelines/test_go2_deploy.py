@@ -15,7 +15,7 @@ from sim2real.artifacts.identification import ROUND_TRIP, Identification
 from sim2real.artifacts.recording import Recording
 from sim2real.errors import SafetyStop, UsageError
 from sim2real.hardware.clock import SYSTEM_CLOCK
-from sim2real.hardware.safety.limits import GateLimits
+from sim2real.hardware.safety.gate import GateLimits
 from sim2real.robots.walking.drive import StandUp
 from sim2real.robots.walking.twin import twin_of
 

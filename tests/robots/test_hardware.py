@@ -10,7 +10,7 @@ from sim2real.artifacts.timing import Timing
 from sim2real.emulation.truth import Kind, read_truth
 from sim2real.errors import SafetyStop, UsageError
 from sim2real.hardware.device import OperatingMode
-from sim2real.hardware.safety.limits import GateLimits
+from sim2real.hardware.safety.gate import GateLimits
 from sim2real.log.reader import read_log
 from sim2real.robots.messages import Goals
 from sim2real.robots.nodes import Excitation

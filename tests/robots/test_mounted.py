@@ -11,7 +11,7 @@ from sim2real.emulation.servo_plant import ServoPlant
 from sim2real.emulation.truth import Kind, read_truth
 from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.joint import Joint
-from sim2real.hardware.safety.limits import GateLimits
+from sim2real.hardware.safety.gate import GateLimits
 from sim2real.log.reader import read_log
 from sim2real.stages.config import RecordConfig
 from sim2real.stages.session.episode import Bench

@@ -7,7 +7,6 @@ from functools import partial
 from typing import Final
 
 from sim2real.hardware.bus.packets import PacketFormat
-from sim2real.hardware.device import Alone, WithoutHost
 
 TWOS_COMPLEMENT: Final = -1
 RETURN_DELAY_UNIT_S: Final = 2e-6
@@ -79,13 +78,14 @@ class ServoModel:
     stops_alone: bool | None
     source: str
 
-    def without_host(self, watchdog_s: float, motors: tuple[str, ...] = ()) -> WithoutHost:
-        """Return the servo's reaction to the death of its host; a ``watchdog_s`` of 0 switches its bus watchdog off."""
+    def without_host(self, watchdog_s: float) -> str:
+        """Return the reaction as a phrase; a ``watchdog_s`` of 0 switches the servo's bus watchdog off."""
         if self.stops_alone is None or not watchdog_s:
             why = "it has no bus watchdog" if self.stops_alone is None else "its bus watchdog is off"
-            return WithoutHost(self.name, motors, Alone.GOES_ON, math.inf, self.source, why)
-        does = Alone.STOPS if self.stops_alone else Alone.GOES_ON
-        return WithoutHost(self.name, motors, does, watchdog_s, self.source)
+            return f"goes on as commanded last ({why})"
+        if self.stops_alone:
+            return f"stops after {watchdog_s:g} s, torque stays on"
+        return f"notices after {watchdog_s:g} s, but goes on as commanded last"
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from sim2real.hardware.bus.packets import BROADCAST_ID, Answer, Instruction
 from sim2real.hardware.bus.port import BusConfig
 from sim2real.hardware.bus.registers import Family, Register, ServoModel
 from sim2real.hardware.clock import SYSTEM_CLOCK, Clock
-from sim2real.hardware.device import POSITION, CommandKind, Counters, Device, Reading, Transaction, WithoutHost
+from sim2real.hardware.device import POSITION, CommandKind, Counters, Device, Reading, Transaction
 from sim2real.hardware.safety.following import MOST_SHARE, RESPONSE_S, SLOW_RAD_S, Following
 
 _LOGGER = logging.getLogger(__name__)
@@ -166,7 +166,6 @@ class Servos(Device):
         self._unit = self._rad if positions else np.full(n, drive.count_unit)
         self._low = np.array([j.low_count if positions else drive.goal.minimum for j in joints_])
         self._high = np.array([j.high_count if positions else drive.goal.maximum for j in joints_])
-        self._goals = np.zeros(n, np.int64)
         # The registers of the state, in one block, and units of speed and load; `open` reads the servos' own of speed.
         state = (family.position, family.velocity, family.load)
         self._state = sorted(state, key=lambda register: register.address)
@@ -263,11 +262,11 @@ class Servos(Device):
             self.close()
             raise
 
-    def without_host(self) -> tuple[WithoutHost, ...]:
+    def without_host(self) -> tuple[str, ...]:
         kinds: dict[ServoModel, list[str]] = {}
         for servo_id, model in self.models.items():
             kinds.setdefault(model, []).append(f"servo {servo_id}")
-        return tuple(m.without_host(self.silence_s, tuple(motors)) for m, motors in kinds.items())
+        return tuple(f"{m.name} ({', '.join(ids)}) {m.without_host(self.silence_s)}" for m, ids in kinds.items())
 
     def facts(self) -> dict[str, dict[str, str]]:
         link, family = self.link, self.family
@@ -293,11 +292,11 @@ class Servos(Device):
         speed_rad_s = min(SLOW_RAD_S, 0.5 * self.drive.speed_rad_s)
         return Following(MOST_SHARE * self.family.full_rad / p_gain, RESPONSE_S, speed_rad_s)
 
-    def enable(self) -> None:
+    def enable(self) -> np.ndarray:
         """Write settings, which a servo may have lost, and goals at rest, and switch the torque on."""
         self.armed = False
         self._guard()
-        link, family = self.link, self.family
+        link, family, goals = self.link, self.family, np.zeros(len(self.ids), np.int64)
         for i, joint in enumerate(self.joints):
             servo_id = joint.servo_id
             # A tripped watchdog refuses goals, so it is cleared first and armed last. The goal comes before torque:
@@ -305,8 +304,8 @@ class Servos(Device):
             if family.watchdog is not None:
                 link.write(servo_id, family.watchdog, 0)
             self._write(servo_id, self.settings(servo_id))
-            self._goals[i] = self._goal_at_rest(i)
-            link.set(servo_id, self.drive.goal, int(self._goals[i]))
+            goals[i] = self._goal_at_rest(i)
+            link.set(servo_id, self.drive.goal, int(goals[i]))
             link.write(servo_id, family.torque, 1)
             if family.watchdog is not None:
                 # Torque may set the goals to rest by itself.
@@ -315,9 +314,7 @@ class Servos(Device):
         if link.at_rest:
             self.armed = False
             raise SafetyStop("torque stays off: the servos have been made safe", hint="open them again")
-
-    def rest(self) -> np.ndarray:
-        return (self._goals - self._zero) * self._unit
+        return (goals - self._zero) * self._unit
 
     def measure(self) -> Reading:
         counts, transaction = self.link.read_counts(self.ids, self._state, "read of the state")

@@ -1,17 +1,86 @@
-"""The safety gate: checks and limits every command before it is sent to an actuator."""
+"""The safety gate: its limits, and the check of every command before it is sent to the motors.
+
+`GateLimits` are the flags of the stages that move a robot; numpy is imported when it is used, for which --help need not
+wait.
+"""
+
+from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TypeAlias
-
-import numpy as np
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from sim2real.errors import SafetyStop, UsageError
-from sim2real.hardware.device import Stale
-from sim2real.hardware.safety.limits import POSITIVE, GateLimits
+from sim2real.later import Later
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from sim2real.hardware.device import Stale
+else:
+    np = Later("numpy")
 
 _Limit: TypeAlias = "float | Sequence[float] | Sequence[Sequence[float]]"
+_POSITIVE: Final = (
+    "slew_per_s",
+    "command_timeout_s",
+    "max_speed_rad_s",
+    "freeze_rad_s",
+    "freeze_s",
+    "first_step_rad",
+    "following_rad",
+    "max_sample_age_s",
+    "stop_s",
+)
+
+
+@dataclass(frozen=True)
+class GateLimits:
+    """The limits of the safety gate, through which every command passes."""
+
+    limit: float = 2.0
+    """Largest magnitude of a command [the actuator's unit: V for the pendulum, rad for the arm]."""
+    slew_per_s: float = 400.0
+    """Largest rate of change of a command [the actuator's unit per second]."""
+    command_timeout_s: float = 0.1
+    """Age from which a command is replaced, by zero volts or, in position mode, by the last one (servos hold) [s]."""
+    max_speed_rad_s: float = 60.0
+    """Joint speed above which the robot is stopped, whether measured or computed from successive positions [rad/s]."""
+    freeze_rad_s: float = 2.0
+    """A joint that moved this fast and then reads the same for 0.05 s stops the robot: its encoder froze [rad/s]."""
+    envelope_rad: tuple[float, float] | None = None
+    """Range of joint angles, lowest and highest; outside of it the robot is stopped; default: not checked [rad]."""
+    first_step_rad: float = 0.5
+    """Largest distance of the first goal from the measured pose; a policy that starts farther away is refused [rad]."""
+    following_rad: float | None = None
+    """Largest distance of a joint from where its goals put it: beyond it the robot is stopped, as the joint let go, is
+    blocked or slips; default: by the identified model, or by the servo's own figures; inf: not checked [rad]."""
+    max_sample_age_s: float = 0.25
+    """Age of the newest measurement above which the robot is stopped instead of commanded [s]."""
+    stop_s: float = 0.5
+    """Longest time in which the first Ctrl-C brings the robot to rest before the torque goes off [s]."""
+    servo_watchdog_s: float = 0.1
+    """Longest silence on the bus; after it the guardian takes the torque off, and the servos' watchdogs trip [s]."""
+
+    def __post_init__(self) -> None:
+        for name in ("limit", *_POSITIVE):
+            value = getattr(self, name, None)
+            if value is not None and not value > 0.0:
+                raise UsageError(f"gate.{name} must be above 0, got {value}")
+        if not 0.02 <= self.servo_watchdog_s <= 2.54:
+            raise UsageError(f"gate.servo_watchdog_s must lie in [0.02, 2.54] s, got {self.servo_watchdog_s}")
+        if self.envelope_rad is not None and not self.envelope_rad[0] < self.envelope_rad[1]:
+            raise UsageError(f"gate.envelope_rad must be the lowest and the highest angle, got {self.envelope_rad}")
+
+    def gate(self, limit: float | tuple[_Limit, _Limit], **settings: Any) -> GateConfig:
+        """Return the gate of a robot with these limits.
+
+        Args:
+            limit: Largest magnitude of a command, or (low, high) [the command's unit].
+        """
+        limits = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("limit", "servo_watchdog_s")}
+        return GateConfig(limit, **limits, **settings)
 
 
 @dataclass(frozen=True)
@@ -41,25 +110,26 @@ class GateConfig(GateLimits):
         # A gate that refuses every command, or the one at rest, would stop the robot at once.
         low, high = self.range
         if low.ndim > 1 + self.has_columns or (low.ndim and high.ndim and low.shape != high.shape):
-            raise UsageError(f"gate of {self.node!r}: limit {self.limit} has another number of lows than of highs")
+            raise self._wrong(f"limit {self.limit} has another number of lows than of highs")
         if not np.all(low <= high):
-            raise UsageError(f"gate of {self.node!r}: limit {self.limit} lets nothing through")
-        stale = [entry if isinstance(entry, float) else 0.0 for entry in self.replacements]
-        fixed = [entry != "hold" for entry in self.replacements]
-        if self.has_columns:
-            for limits in (low, high):
-                if limits.ndim and limits.shape[-1] != len(stale):
-                    raise UsageError(f"gate of {self.node!r}: limits for {limits.shape[-1]} of {len(stale)} columns")
-        if not np.all((low <= stale) & (high >= stale) | ~np.asarray(fixed)):
-            what = f"{stale}, the stale command" if self.has_columns else f"{stale[0]:g}, the command at rest"
-            raise UsageError(f"gate of {self.node!r}: limit {self.limit} does not contain {what}")
+            raise self._wrong(f"limit {self.limit} lets nothing through")
+        for limits in (low, high) if self.has_columns else ():
+            if limits.ndim and limits.shape[-1] != len(self.replacements):
+                raise self._wrong(f"limits for {limits.shape[-1]} of {len(self.replacements)} columns")
+        stale = np.array([{"zero": 0.0, "hold": np.nan}.get(entry, entry) for entry in self.replacements])
+        if np.any((low > stale) | (high < stale)):
+            what = f"{stale.tolist()}, the stale command" if self.has_columns else f"{stale[0]:g}, the command at rest"
+            raise self._wrong(f"limit {self.limit} does not contain {what}")
         if self.envelope_rad is not None and not np.all(np.less(*map(np.asarray, self.envelope_rad))):
-            raise UsageError(f"gate of {self.node!r}: envelope_rad = {self.envelope_rad} holds no position")
+            raise self._wrong(f"envelope_rad = {self.envelope_rad} holds no position")
         # All other limits are positive, each one value or one per joint.
-        for name in ("slew_per_s", "freeze_s", *POSITIVE):
+        for name in _POSITIVE:
             value = getattr(self, name)
             if value is not None and not np.all(np.asarray(value) > 0.0):
-                raise UsageError(f"gate of {self.node!r}: {name} = {value} must be larger than 0")
+                raise self._wrong(f"{name} = {value} must be larger than 0")
+
+    def _wrong(self, fault: str) -> UsageError:
+        return UsageError(f"gate of {self.node!r}: {fault}")
 
     def joint(self, index: int) -> str:
         """Return a joint's name for errors."""
@@ -85,6 +155,18 @@ class GateConfig(GateLimits):
         """Lowest and highest command, each of shape () or (n,); (k,) or (n, k) for commands with columns."""
         low, high = self.limit if isinstance(self.limit, tuple) else (-self.limit, self.limit)
         return np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
+
+    def at_rest(self, last: np.ndarray) -> np.ndarray:
+        """Return the replacement of a stale command after the last one, ``(n,)`` or ``(n, k)``."""
+        replaced = np.array(last, np.float64)
+        for column, stale in enumerate(self.replacements):
+            if stale != "hold":
+                replaced[..., column if self.has_columns else slice(None)] = 0.0 if stale == "zero" else stale
+        return replaced
+
+    def pushes(self, sent: np.ndarray) -> np.ndarray:
+        """Return which joints a command pushes, ``(n,)``: it holds a position, or differs from the one at rest."""
+        return (sent != self.at_rest(sent)).reshape(len(sent), -1).any(axis=1) | (self.stale == "hold")
 
 
 @dataclass
@@ -132,11 +214,7 @@ class SafetyGate:
         """The replacement of a stale command, shape (n,) or (n, k); UsageError without a `start` or a command."""
         if self._last is None:
             raise UsageError(f"gate of {self.config.node!r} has nothing to hold", hint="call reset(start) first")
-        replaced = self._last.copy()
-        for column, stale in enumerate(self.config.replacements):
-            if stale != "hold":
-                replaced[..., column if self.config.has_columns else slice(None)] = 0.0 if stale == "zero" else stale
-        return replaced
+        return self.config.at_rest(self._last)
 
     def apply(
         self, command: np.ndarray, age_s: float, now_s: float, speed_rad_s: np.ndarray | float | None = None
@@ -173,15 +251,13 @@ class SafetyGate:
             self.counts.stale += 1
             allowed = fallback
         else:
-            allowed = self._slew(self._clamp(wanted), now_s)
+            clamped = np.clip(wanted, self._low, self._high)
+            self.counts.clamped += bool(np.any(clamped != wanted))
+            allowed = self._slew(clamped, now_s)
+            self.counts.slewed += bool(np.any(allowed != clamped))
         self._last, self._last_s = allowed, now_s
         self.counts.passed += 1
         return allowed.copy()
-
-    def _clamp(self, wanted: np.ndarray) -> np.ndarray:
-        clamped = np.clip(wanted, self._low, self._high)
-        self.counts.clamped += bool(np.any(clamped != wanted))
-        return clamped
 
     def _slew(self, wanted: np.ndarray, now_s: float) -> np.ndarray:
         if self.config.slew_per_s is None or self._last is None:
@@ -193,19 +269,17 @@ class SafetyGate:
         limit = np.asarray(self.config.slew_per_s, np.float64)
         # Infinite times 0 s is no number, but no limit.
         largest = limit * elapsed_s if elapsed_s > 0.0 else np.where(np.isinf(limit), np.inf, 0.0)
-        slewed = np.clip(wanted, self._last - largest, self._last + largest)
-        self.counts.slewed += bool(np.any(slewed != wanted))
-        return slewed
+        return np.clip(wanted, self._last - largest, self._last + largest)
 
     def _require_shape(self, values: np.ndarray) -> None:
-        columns = self.config.has_columns
+        columns, node = self.config.has_columns, self.config.node
         if values.ndim != 1 + columns or (columns and values.shape[1] != len(self.config.replacements)):
             wanted = f"(n, {len(self.config.replacements)})" if columns else "(n,)"
-            raise UsageError(f"gate of {self.config.node!r}: commands of shape {values.shape}, not {wanted}")
+            raise UsageError(f"gate of {node!r}: commands of shape {values.shape}, not {wanted}")
         for other in (self._low, self._high, self._last):
             if other is not None and other.ndim > columns and other.shape != values.shape:
                 raise UsageError(
-                    f"gate of {self.config.node!r}: commands of shape {values.shape}, limits or start of {other.shape}"
+                    f"gate of {node!r}: commands of shape {values.shape}, limits or start of {other.shape}"
                 )
 
     def _require_finite(self, what: str, values: np.ndarray) -> None:

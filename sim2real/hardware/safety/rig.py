@@ -69,7 +69,6 @@ class Rig:
         commanding: The bus's use by `command` since `start`.
         torque_withheld: Whether this is a dry run; see `withhold_torque`.
         following: How the joints follow their commands, which `measure` checks; None: not known, or not checked.
-        repeats: Readings since `start` that were the sample before once again, by the device's tick.
 
     Raises:
         UsageError: Gate, joints and device do not fit together.
@@ -77,25 +76,30 @@ class Rig:
     """
 
     def __init__(self, device: Device, gate: GateConfig, joints: Sequence[Joint] = ()) -> None:
-        # The gate, the joints, and the last commands and measurements.
-        _require_stale(gate, device)
+        kind = device.commanded
+        if gate.stale != kind.stale:
+            raise UsageError(
+                f"gate of {gate.node!r}: stale = {gate.stale!r} is not safe with {kind.name}",
+                hint=f"stale = {kind.stale!r} is",
+            )
         self._mounting = Mounting(joints, device)
         self.device = device
         self.gate = SafetyGate(gate)
         self._plausibility = Plausibility(gate)
         self.following: Following | None = None
         self._follow_check: FollowingCheck | None = None
+        # The last command, when it was sent, and the last measurement; `start` forgets them.
         self._sent: np.ndarray | None = None
+        self._commanded_s: float | None = None
         self._speed_rad_s: np.ndarray | None = None
         self._position_rad: np.ndarray | None = None
+        self._sampled_s: float | None = None
+        self._tick: int | None = None
         self._is_first = False  # whether the next command is the first of its sender
         self._checked_s = 0.0
-        self._sampled_s: float | None = None
+        # A soft stop: when it began, and the last command before it.
         self._eased_s: float | None = None
         self._before_stop: np.ndarray | None = None
-        self._commanded_s: float | None = None
-        self._tick: int | None = None
-        self.repeats = 0
         self._lock = threading.Lock()
         self._done = threading.Event()
         self._on = False  # whether commands may be sent
@@ -141,16 +145,17 @@ class Rig:
             self._done.set()
             self._done = threading.Event()
             self._commanded_s = self._speed_rad_s = self._failure = self._sampled_s = self._eased_s = None
-            self._tick, self.repeats = None, 0
+            self._tick = self._position_rad = None
             self.measuring, self.commanding = BusUse(), BusUse()
             self._require_reach()
             try:
                 # The slew limit starts from the command that the motors follow at rest.
                 self.gate.reset(self._begin_at_rest())
                 self._plausibility.reset()
-                self._position_rad = None
                 self._sent = self.gate.fallback
-                self._begin_following()
+                self._follow_check = None
+                if self.following is not None and not self.torque_withheld:
+                    self._follow_check = FollowingCheck(self.following, self._sent, self._now_s(), self._name)
                 self._is_first = True
                 self._on = True
                 if not self.torque_withheld:
@@ -205,29 +210,30 @@ class Rig:
             SafetyStop: A motor has stopped itself, or a measurement is not plausible.
             HardwareLost: The device is silent.
         """
-        self._check()
-        self._supervise()
+        self._require_no_failure()
+        # Twice a second the device looks for motors that stopped without an error in their answers: before the state is
+        # read, not after, as a measurement should not wait.
+        if (now_s := self._now_s()) - self._checked_s > _CHECK_PERIOD_S:
+            self.device.check()
+            self._checked_s = now_s
         # Take the last command before the reading, as it acted while the sample was taken.
         sent = self._sent
         measured = self.device.measure()
         reading, transaction = self._mounting.reading(measured), measured.transaction
         self.measuring.add(transaction)
         # The same sample once again adds nothing to the checks.
-        repeated = measured.tick is not None and measured.tick == self._tick
-        self._tick = measured.tick
-        if repeated:
-            self.repeats += 1
+        if measured.tick is not None and measured.tick == self._tick:
             return reading
+        self._tick = measured.tick
         require_parts(measured.parts, self.device.parts)
         pushed = np.zeros(len(measured.position_rad), bool)
         if sent is not None and not self.torque_withheld:
-            pushed = _pushed(sent, self.gate.config)
-        sampled_s = 1e-9 * transaction.t_sent_ns
-        self._plausibility.check(reading.position_rad, sampled_s, 1e-9 * transaction.late_ns, pushed)
+            pushed = self.gate.config.pushes(sent)
+        sampled_s, late_s = 1e-9 * transaction.t_sent_ns, 1e-9 * transaction.late_ns
+        self._plausibility.check(reading.position_rad, sampled_s, late_s, pushed)
         self._speed_rad_s, self._sampled_s = reading.velocity_rad_s, sampled_s
         self._position_rad = reading.position_rad
         if self._follow_check is not None and self._on:
-            late_s = 1e-9 * transaction.late_ns
             self._follow_check.check(reading.position_rad, reading.velocity_rad_s, reading.load, sampled_s, late_s)
         return reading
 
@@ -253,7 +259,7 @@ class Rig:
             HardwareLost: The device is silent.
         """
         with self._lock:
-            self._check()
+            self._require_no_failure()
             if not self._on:
                 raise SafetyStop("no command is sent: the torque is off", hint="start the rig first")
             self._require_near(np.asarray(command, np.float64))
@@ -280,9 +286,9 @@ class Rig:
             )
 
     def ease(self) -> None:
-        """Begin a soft stop: from now on the device softens the last command within ``stop_s``.
+        """Begin a soft stop: from now on commands fade to what replaces a stale one, within ``stop_s``.
 
-        Voltages fade to zero, goals keep their values, and legs sit down.
+        Voltages fade to zero, goals keep their values, and legs sink: their gains fade to damping.
         """
         self._eased_s, self._before_stop = self._now_s(), self._sent
 
@@ -304,10 +310,11 @@ class Rig:
         if self._eased_s is None or self._before_stop is None:
             return command
         # A goal that is held stays the last one; a voltage that fades is the agent's newest.
-        left = 1.0 - (self._now_s() - self._eased_s) / (_FADE * self.gate.config.stop_s)
-        keeps = self.gate.config.holds or self.gate.config.has_columns
-        last = self._before_stop if keeps else np.asarray(command)
-        return self._mounting.to_joints(self.device.soften(self._mounting.to_motors(last), max(0.0, left)))
+        config = self.gate.config
+        last = self._before_stop if config.holds else np.asarray(command)
+        left = max(0.0, 1.0 - (self._now_s() - self._eased_s) / (_FADE * config.stop_s))
+        rest = config.at_rest(last)
+        return rest + left * (last - rest)
 
     def wait_until_still(self, timeout_s: float, speed_rad_s: float = _STILL_RAD_S, for_s: float = 0.5) -> Reading:
         """Wait, with torque off, until all joints are still; raise HardwareLost if they move after ``timeout_s``.
@@ -337,12 +344,12 @@ class Rig:
             self.clock.sleep(0.02)
 
     def _begin_at_rest(self) -> np.ndarray:
-        """Switch the torque on, and return the command that the joints follow then; without torque, their pose."""
+        """Switch the torque on, and return the command that the joints follow; without torque, the safe one there."""
         if not self.torque_withheld:
-            self.device.enable()
-        elif self.device.commanded.stale == "hold":
-            return self._mounting.reading(self.device.measure()).position_rad
-        return self._mounting.to_joints(self.device.rest())
+            return self._mounting.to_joints(self.device.enable())
+        units, here = self.device.commanded.units, self._mounting.reading(self.device.measure()).position_rad
+        columns = np.stack([here if unit == "rad" else np.zeros_like(here) for unit in units], axis=-1)
+        return self.gate.config.at_rest(columns if self.gate.config.has_columns else columns[:, 0])
 
     def _follows(self) -> Following | None:
         """Return how the joints follow their commands, by the device's own figures."""
@@ -368,11 +375,6 @@ class Rig:
         named = index < len(self.gate.config.joints)
         return self.gate.config.joint(index) if named else self.device.motors[index]
 
-    def _begin_following(self) -> None:
-        self._follow_check = None
-        if self.following is not None and self._sent is not None and not self.torque_withheld:
-            self._follow_check = FollowingCheck(self.following, self._sent, self._now_s(), self._name)
-
     def _require_near(self, command: np.ndarray) -> None:
         """Refuse a sender whose first goals are far away from the measured pose."""
         if not self._is_first:
@@ -394,16 +396,9 @@ class Rig:
                 hint="bring the robot to the pose in which the policy starts; first_step_rad sets the limit",
             )
 
-    def _check(self) -> None:
+    def _require_no_failure(self) -> None:
         if self._failure is not None:
             raise self._failure
-
-    def _supervise(self) -> None:
-        """Let the device check twice a second for motors that stopped without an error in their answers."""
-        now_s = self._now_s()
-        if now_s - self._checked_s > _CHECK_PERIOD_S:
-            self.device.check()  # before the state is read, not after: a measurement should not wait
-            self._checked_s = now_s
 
     def _require_reach(self) -> None:
         """Refuse gate limits beyond the reach of the motors, or for another number of motors."""
@@ -472,21 +467,3 @@ class Rig:
 
     def _now_s(self) -> float:
         return 1e-9 * self.clock.now_ns()
-
-
-def _pushed(sent: np.ndarray, gate: GateConfig) -> np.ndarray:
-    """Return which joints a command pushes, (n,): it holds a position, or differs from its replacement when stale."""
-    pushed = np.full(len(sent), gate.stale == "hold")
-    for column, stale in zip(sent.reshape(len(sent), -1).T, gate.replacements, strict=True):
-        if stale != "hold":
-            pushed |= column != (0.0 if stale == "zero" else stale)
-    return pushed
-
-
-def _require_stale(gate: GateConfig, device: Device) -> None:
-    kind = device.commanded
-    if gate.stale != kind.stale:
-        raise UsageError(
-            f"gate of {gate.node!r}: stale = {gate.stale!r} is not safe with {kind.name}",
-            hint=f"stale = {kind.stale!r} is",
-        )

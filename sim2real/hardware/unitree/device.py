@@ -2,7 +2,6 @@
 
 import atexit
 import logging
-import math
 import os
 import sys
 import threading
@@ -18,7 +17,6 @@ import numpy as np
 from sim2real.errors import HardwareLost, SafetyStop, UsageError
 from sim2real.hardware.clock import SYSTEM_CLOCK, Clock
 from sim2real.hardware.device import (
-    Alone,
     CommandColumn,
     CommandKind,
     Counters,
@@ -26,7 +24,6 @@ from sim2real.hardware.device import (
     Reading,
     ReadingPart,
     Transaction,
-    WithoutHost,
 )
 from sim2real.hardware.safety import guardian as guardians
 from sim2real.hardware.safety.following import Following
@@ -50,10 +47,6 @@ PARTS: Final[Mapping[str, ReadingPart]] = MappingProxyType(
 The force on a foot is the count of its sensor, in the order FR, FL, RR, RL: Unitree documents no unit."""
 _WEAK_NM, _WEAK_S = 5.0, 0.1
 """By how much a motor's torque may be weaker than its law [N m], on average over a time [s]."""
-_SOURCE: Final = (
-    "Unitree documents no reaction of a Go2; a motor of its GO family goes on (unitree_actuator_sdk, issue 29); "
-    "not measured by us"
-)
 _LOGGER = logging.getLogger(__name__)
 _FIRST_STATE_S: Final = 5.0
 _OPEN_S: Final = 3.0
@@ -99,7 +92,6 @@ class UnitreeLegs(Device):
         self.address, self.drive = Address.parse(port), drive or LegDrive()
         self._silence_s, self._max_silence_s = silence_s, max_silence_s
         self._places = np.array(ids)
-        self._rest = np.zeros((MOTORS, 5))
         self._damp = self.drive.damp()  # built here, as make_safe must not need any time
         self._clock: Clock = SYSTEM_CLOCK
         self._robot: DdsLink | None = None
@@ -132,9 +124,9 @@ class UnitreeLegs(Device):
         return self._silence_s
 
     @property
-    def measures(self) -> Mapping[str, str]:
-        """Quantity -> unit of a reading; the load is the torque that the motor estimates."""
-        return {"position": "rad", "velocity": "rad/s", "load": "N m"}
+    def load_unit(self) -> str:
+        """Unit of the torque that a motor estimates."""
+        return "N m"
 
     @property
     def parts(self) -> Mapping[str, ReadingPart]:
@@ -190,9 +182,9 @@ class UnitreeLegs(Device):
         self._robot, self._stream = robot, stream
         atexit.register(self.close)
 
-    def without_host(self) -> tuple[WithoutHost, ...]:
-        """Return the worst reaction, as none is documented."""
-        return (WithoutHost("Go2", self.motors, Alone.GOES_ON, math.inf, _SOURCE, "no other reaction is documented"),)
+    def without_host(self) -> tuple[str, ...]:
+        """Return the worst reaction, as a motor of the GO family has (unitree_actuator_sdk, issue 29); not measured."""
+        return (f"Go2 ({', '.join(self.motors)}) goes on as commanded last (no other reaction is documented)",)
 
     def facts(self) -> dict[str, dict[str, str]]:
         # Versions of 0 are those that the robot does not report.
@@ -211,22 +203,19 @@ class UnitreeLegs(Device):
         low, high = self.drive.reach
         return low[self._places], high[self._places]
 
-    def enable(self) -> None:
+    def enable(self) -> np.ndarray:
         """Start the guardian, and let all motors damp at their positions; see `Device.enable`."""
-        self._rest = np.zeros((MOTORS, 5))
+        rest = np.zeros((MOTORS, 5))
         low, high = self.reach()
         # A robot that lies may rest on the stops of its joints, a little beyond their range.
-        self._rest[:, 0] = np.clip(self.measure().position_rad, low[:, 0], high[:, 0])
-        self._rest[:, 3] = self.drive.damping
-        self._switch_on(self._message(self._rest))
+        rest[:, 0] = np.clip(self.measure().position_rad, low[:, 0], high[:, 0])
+        rest[:, 3] = self.drive.damping
+        self._switch_on(self._message(rest))
+        return rest
 
     def following(self) -> Following:
         """Return by how much a motor's torque may be weaker than its law."""
         return Following(_WEAK_NM, _WEAK_S, source="the motors' own torques", most_nm=TORQUE_NM[self._places])
-
-    def rest(self) -> np.ndarray:
-        """Return the command since `enable`, ``(12, 5)``: the positions of that time without a gain, and damping."""
-        return self._rest.copy()
 
     def measure(self) -> Reading:
         """Wait for the next state: positions [rad], speeds [rad/s], estimated torques [N m], and `PARTS`."""
@@ -261,12 +250,6 @@ class UnitreeLegs(Device):
             self._stop_if_halted()
             self._published += 1
             return Transaction(begin_ns, begin_ns - called_ns, self.clock.now_ns() - begin_ns, 0)
-
-    def soften(self, command: np.ndarray, left: float) -> np.ndarray:
-        """Return the command with a smaller position gain and torque, and more damping: the robot sinks."""
-        softer = command * [1.0, left, left, left, left]
-        softer[:, 3] += (1.0 - left) * self.drive.damping
-        return softer
 
     def check(self) -> None:
         """Raise SafetyStop if another program publishes commands too."""

@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from sim2real.hardware.dynamixel import PositionDrive
     from sim2real.hardware.feetech import StsDrive
     from sim2real.hardware.joint import Joint
-    from sim2real.hardware.safety.gate import GateConfig
-    from sim2real.hardware.safety.limits import GateLimits
+    from sim2real.hardware.safety.gate import GateConfig, GateLimits
     from sim2real.hardware.safety.rig import Rig
 
 

@@ -23,8 +23,7 @@ from sim2real.types import Array
 
 if TYPE_CHECKING:
     from sim2real.hardware.device import Device, Reading
-    from sim2real.hardware.safety.gate import GateConfig
-    from sim2real.hardware.safety.limits import GateLimits
+    from sim2real.hardware.safety.gate import GateConfig, GateLimits
     from sim2real.hardware.safety.rig import Rig
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from sim2real.errors import UsageError
-from sim2real.hardware.safety.limits import GateLimits
+from sim2real.hardware.safety.gate import GateLimits
 from sim2real.stages.flag import Flag, ViewFlag, check_seed, check_view
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated
 
 from sim2real.errors import UsageError
-from sim2real.hardware.safety.limits import GateLimits
+from sim2real.hardware.safety.gate import GateLimits
 from sim2real.stages.flag import Flag, ViewFlag, check_seed, check_view
 
 GENERATED, HAND, STANDING = ("multisine", "chirp", "steps"), "hand", "standing"

@@ -15,7 +15,7 @@ import numpy as np
 from sim2real.errors import HardwareLost, SafetyStop, UsageError
 from sim2real.hardware.bus.port import Port, open_port
 from sim2real.hardware.clock import SYSTEM_CLOCK, Clock
-from sim2real.hardware.device import Alone, CommandKind, Counters, Device, Reading, Transaction, WithoutHost
+from sim2real.hardware.device import CommandKind, Counters, Device, Reading, Transaction
 
 SPEED = CommandKind("speeds", "rad/s", stale="zero")
 TURN = 2.0 * math.pi  # the board counts in turns
@@ -118,17 +118,11 @@ class ODrive(Device):
         """The clock of the port: all waiting and all stamps are on it."""
         return SYSTEM_CLOCK if self._line is None else self._line.clock
 
-    @property
-    def measures(self) -> dict[str, str]:
-        """Position and velocity: the board's answer has no more."""
-        return {"position": "rad", "velocity": "rad/s"}
-
-    def without_host(self) -> tuple[WithoutHost, ...]:
-        """Return what the board does: it disarms an axis that is not fed."""
+    def without_host(self) -> tuple[str, ...]:
+        """Return what firmware 0.5 does: it disarms an axis that is not fed (axis.config.watchdog_timeout)."""
         if not self._silence_s:
-            return (WithoutHost("ODrive v3", self.motors, Alone.GOES_ON, math.inf, "its watchdog is not enabled"),)
-        source = "ODrive firmware 0.5: axis.config.watchdog_timeout, read back when it is set"
-        return (WithoutHost("ODrive v3", self.motors, Alone.TORQUE_OFF, self._silence_s, source),)
+            return ("ODrive v3 (axis 0) goes on as commanded last (its watchdog is not enabled)",)
+        return (f"ODrive v3 (axis 0) takes its torque off after {self._silence_s:g} s",)
 
     def reach(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the board's limit of speed, either way [rad/s]."""
@@ -157,7 +151,7 @@ class ODrive(Device):
             self.close()
             raise
 
-    def enable(self) -> None:
+    def enable(self) -> np.ndarray:
         """Switch the torque on at speed 0; from then on the board wants to be fed."""
         if self._halted:
             raise SafetyStop("the torque was taken off for good", hint="open the device again")
@@ -169,9 +163,6 @@ class ODrive(Device):
         self._await(CLOSED_LOOP)
         if self._halted:
             self.make_safe()  # it may have come just before
-
-    def rest(self) -> np.ndarray:
-        """Return speed 0."""
         return np.zeros(1)
 
     def measure(self) -> Reading:
