@@ -116,7 +116,7 @@ class GateConfig(GateLimits):
         for limits in (low, high) if self.has_columns else ():
             if limits.ndim and limits.shape[-1] != len(self.replacements):
                 raise self._wrong(f"limits for {limits.shape[-1]} of {len(self.replacements)} columns")
-        stale = np.array([{"zero": 0.0, "hold": np.nan}.get(entry, entry) for entry in self.replacements])
+        stale = np.array([{"zero": 0.0, "hold": np.nan}.get(str(entry), entry) for entry in self.replacements], float)
         if np.any((low > stale) | (high < stale)):
             what = f"{stale.tolist()}, the stale command" if self.has_columns else f"{stale[0]:g}, the command at rest"
             raise self._wrong(f"limit {self.limit} does not contain {what}")
