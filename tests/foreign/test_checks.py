@@ -13,7 +13,7 @@ NAMES = ("a", "b", "c")
 def findings(goal=GOAL, q=Q, t_goal=T, t_q=T, by_name=True):
     """Return kind, joint and weight of what the check finds, apart from notes."""
     found = checks.check((t_goal, t_q), goal, q, NAMES, by_name)
-    return [(f.kind, f.joint, f.weight) for f in found if f.weight != "note"]
+    return [(f.name, f.joint, f.weight) for f in found if f.weight != "note"]
 
 
 @pytest.mark.parametrize("by_name", [True, False])
@@ -81,7 +81,7 @@ def test_a_clock_of_another_rate_is_found(rate, weight):
 def test_a_zero_that_steps_is_named_with_its_time(side, size):
     step = size * (T >= 9.0)[:, None] * np.array([0, 1, 0])
     goal, q = (GOAL, Q + step) if side == "reading" else (GOAL + step, Q)
-    (found,) = [f for f in checks.check((T, T), goal, q, NAMES) if f.kind == "zero"]
+    (found,) = [f for f in checks.check((T, T), goal, q, NAMES) if f.name == "zero"]
     assert found.joint == 1
     assert found.weight == ("refuse" if side == "reading" and abs(size) > 0.1 else "warn")
     assert "9.0" in found.text
@@ -91,7 +91,7 @@ def test_a_zero_that_steps_is_named_with_its_time(side, size):
 @pytest.mark.parametrize("seconds", [(4.0, 9.0, 15.0), (4.0, 15.0)])
 def test_a_zero_that_steps_several_times_is_named_with_each(size, seconds):
     q = Q + size * np.sum([at <= T for at in seconds], axis=0)[:, None] * np.array([0, 1, 0])
-    (found,) = [f for f in checks.check((T, T), GOAL, q, NAMES) if f.kind == "zero"]
+    (found,) = [f for f in checks.check((T, T), GOAL, q, NAMES) if f.name == "zero"]
     assert (found.joint, all(f"{at:.2f} s" in found.text for at in seconds)) == (1, True)
 
 
@@ -100,7 +100,7 @@ def test_a_slip_and_a_turn_of_the_goals_are_said_also_where_nothing_follows(size
     slip = size * np.clip((T - 8.0) / 4.0, 0, 1)[:, None] * np.array([0, 1, 0])
     turn = size * (T >= 9.0)[:, None] * np.array([0, 1, 0])
     for goal, q in ((GOAL, Q + slip), (GOAL + turn, Q)):
-        assert [f.joint for f in checks.check((T, T), goal, q, NAMES) if f.kind == "zero"] == [1]
+        assert [f.joint for f in checks.check((T, T), goal, q, NAMES) if f.name == "zero"] == [1]
 
 
 def test_an_offset_at_rest_is_said():
@@ -113,9 +113,9 @@ def test_commands_that_are_too_slow_for_the_motion_are_said():
     goal = 0.08 * np.sin(2 * np.pi * np.outer(t, rng.uniform(0.2, 12, 10)) + rng.uniform(0, 6, 10)).sum(axis=1)
     q = servo(t, goal, wn=60.0)
     found = checks.check((t[::25], t), goal[::25, None], q[:, None], ("a",))
-    assert "rate" in {f.kind for f in found}
+    assert "rate" in {f.name for f in found}
     found = checks._rates((t[::25], t), goal[::25, None], q[:, None])
-    assert [f.kind for f in found] == ["rate"]
+    assert [f.name for f in found] == ["rate"]
     assert checks._rates((t[::2], t), goal[::2, None], q[:, None]) == []
 
 

@@ -100,7 +100,7 @@ def test_a_vendors_names_are_matched_by_leg_and_number(tmp_path):
     episode, found = imported(tmp_path / "run.npz", joints=MODEL)
     np.testing.assert_allclose(episode.outputs["sensor"]["position"], q[:, [3, 4, 5, 0, 1, 2]])
     np.testing.assert_allclose(episode.outputs["actuator"]["goal"], goal[:, [3, 4, 5, 0, 1, 2]])
-    assert any("fl_0 is FL_hip_joint" in line for line in found.evidence)
+    assert any("FL_0 is FL_hip_joint" in line for line in found.evidence)
 
 
 @pytest.mark.parametrize(

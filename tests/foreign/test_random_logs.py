@@ -42,7 +42,7 @@ def outcome(seed, folder):
         for _ in range(3):
             episode = import_table(table, mapping)
             findings = checks.check_episode(episode, log.joints, log.named) if found.questions else []
-            told = {f.kind for f in findings if f.weight == "refuse"}
+            told = {f.name for f in findings if f.weight == "refuse"}
             if not told:
                 break
             # What the data refuse, the user corrects as the error says.

@@ -39,37 +39,46 @@ known; ``note``: evidence."""
 
 
 @dataclass(frozen=True)
-class Finding:
-    """A sentence on the data of one joint, or of all.
+class Check:
+    """What the data say about one joint, or about all.
 
     Attributes:
-        kind: ``order``, ``sign``, ``slope``, ``lag``, ``copy``, ``clock``, ``overlap``, ``zero``, ``rate``, ``scale``,
-            ``still`` or ``follows``.
+        name: A key of ``CHECKS``.
         joint: Number of the joint; -1 for all.
+        text: The evidence.
     """
 
-    kind: str
+    name: str
     joint: int
     text: str
     weight: Weight
 
+    @property
+    def question(self) -> str:
+        """The key of a mapping that answers it; empty: the file is wrong, or the mapping in several keys."""
+        return CHECKS[self.name][0]
 
-_HINTS = {
-    "overlap": "stamp_offset of the commands adds seconds to their clock, in a mapping",
-    "sign": "change the sign of that joint's scale, such as scale = [1, -1]",
-    "order": "list the sources in the order of the positions",
-    "copy": "log the commands that were sent, not the measurements",
-    "clock": "stamp both streams with one clock, such as a recorder's",
-    "zero": "cut the file where the zero moves: --samples A:B",
-    "scale": "name the other joints with --joints, or give the column its own scale in a mapping",
-    "slope": "correct the unit, or name the other joints with --joints",
-    "lag": "exchange the names, or correct stamp_offset",
+
+CHECKS = {
+    "follows": ("unit", ""),
+    "slope": ("unit", "correct the unit, or name the other joints with --joints"),
+    "sign": ("scale", "change the sign of that joint's scale, such as scale = [1, -1]"),
+    "order": ("source", "list the sources in the order of the positions"),
+    "lag": ("", "exchange the names, or correct stamp_offset"),
+    "overlap": ("", "stamp_offset of the commands adds seconds to their clock, in a mapping"),
+    "clock": ("", "stamp both streams with one clock, such as a recorder's"),
+    "copy": ("", "log the commands that were sent, not the measurements"),
+    "zero": ("", "cut the file where the zero moves: --samples A:B"),
+    "scale": ("", "name the other joints with --joints, or give the column its own scale in a mapping"),
+    "rate": ("", "log both sides faster than the motion"),
+    "still": ("", "move the joint"),
 }
+"""Name of a check -> the key of a mapping that answers it, and what else to do."""
 
 
-def hint_for(findings: Sequence[Finding]) -> str:
-    """Return what to do about findings that refuse an import."""
-    hints = dict.fromkeys(_HINTS.get(f.kind, "correct the mapping") for f in findings)
+def hint_for(wrong: Sequence[Check]) -> str:
+    """Return what to do about checks that refuse an import."""
+    hints = dict.fromkeys(CHECKS[c.name][1] or "correct the mapping" for c in wrong)
     return "; ".join(hints) + "; --as-told imports it all the same"
 
 
@@ -80,7 +89,7 @@ def check(
     names: Sequence[str],
     by_name: bool = True,
     acting: np.ndarray | None = None,
-) -> list[Finding]:
+) -> list[Check]:
     """Compare goals and positions of the same joints in one unit.
 
     Args:
@@ -94,7 +103,7 @@ def check(
     found = respond(t_s, goal, position, acting)
     if found is None:
         text = "the stamps of goals and positions overlap in fewer than 50 samples: nothing is checked"
-        return [Finding("overlap", -1, text, "refuse")]
+        return [Check("overlap", -1, text, "refuse")]
     judged = [_judge(found, i, names, by_name, t_s, goal, position) for i in range(len(names))]
     findings = [wrong for wrong, _, _ in judged if wrong is not None]
     following = [i for i, (wrong, _, _) in enumerate(judged) if wrong is None]
@@ -102,38 +111,39 @@ def check(
     clock = _clock(t_s, goal, position, following or moving, acting)
     rates = _rates(t_s, goal[:, moving], position[:, moving]) if moving else []
     if any(f.weight == "refuse" for f in clock):
-        findings = [f for f in findings if f.kind not in ("follows", "lag")]
+        findings = [f for f in findings if f.name not in ("follows", "lag")]
     elif moving and not following and not any(f.weight in ("refuse", "ask") for f in findings):
         # The cause is told first.
         told = [*(f.text for f in rates), "no position follows its goal: units, signs, order and clocks are unproven"]
         text = "; ".join(told)
-        findings.append(Finding("follows", -1, text, "ask"))
+        findings.append(Check("follows", -1, text, "ask"))
     findings += clock
     if following:
         late = ", ".join(f"{names[i]} {1e3 * judged[i][2]:.0f} ms" for i in following[:6])
         text = f"positions follow their goals: {late}" + " ..." * (len(following) > 6)
-        findings.append(Finding("follows", -1, text, "note"))
+        findings.append(Check("follows", -1, text, "note"))
     if not any(f.weight == "refuse" for f in findings):
         for i in moving:
             lag_s = judged[i][2] if i in following else None
             findings += _zero(t_s, goal[:, i], position[:, i], i, names[i], lag_s)
-    return [*findings, *rates, *_scales(position, names)]
+    return [*findings, *rates, *odd_columns(position, names)]
 
 
-def check_episode(episode: Episode, joints: Sequence[str] = (), by_name: bool = True) -> list[Finding]:
+def check_episode(episode: Episode, joints: Sequence[str] = (), by_name: bool = True) -> list[Check]:
     """Compare the goals and positions of an imported episode; see ``check``."""
     sensed, commands = episode.outputs.get("sensor", {}), episode.outputs.get("actuator", {})
     units = {**episode.units.get("actuator", {}), **episode.units.get("sensor", {})}
     enabled = [values for name, values in commands.items() if meaning(name).quantity == "enabled"]
     acting = np.asarray((enabled[0].reshape(len(enabled[0]), -1) > 0).all(axis=1)) if len(enabled) == 1 else None
-    findings: list[Finding] = []
+    findings: list[Check] = []
     for (name, position), (goal, values) in itertools.product(sensed.items(), commands.items()):
         named = meaning(goal)
         if meaning(name).quantity != "position" or named.side != "command" or named.quantity not in ("", "position"):
             continue
         flat = values.reshape(len(values), -1), position.reshape(len(position), -1)
         if units.get(goal) == units.get(name) and flat[0].shape[1] == flat[1].shape[1]:
-            names = joints if len(joints) == flat[1].shape[1] else [f"joint {i}" for i in range(flat[1].shape[1])]
+            names = joints if len(joints) == flat[1].shape[1] else list(map(str, range(flat[1].shape[1])))
+            names = [f"joint {name}" if name.isdigit() else name for name in names]
             t_s = episode.steps["actuator"].begun_s, episode.steps["sensor"].begun_s
             findings += check(t_s, *flat, names, by_name, acting)
     return findings
@@ -141,7 +151,7 @@ def check_episode(episode: Episode, joints: Sequence[str] = (), by_name: bool = 
 
 def slow_sides(episode: Episode) -> list[str]:
     """Return a sentence if commands are logged too seldom for the motion of an episode, or the other way round."""
-    return [finding.text for finding in check_episode(episode) if finding.kind == "rate"]
+    return [finding.text for finding in check_episode(episode) if finding.name == "rate"]
 
 
 # -- measures of goals and positions
@@ -210,7 +220,7 @@ def respond(
 
 
 def _judge(found: Response, i: int, names: Sequence[str], by_name: bool, t_s: tuple[np.ndarray, np.ndarray],
-           goal: np.ndarray, position: np.ndarray) -> tuple[Finding | None, bool, float]:  # fmt: skip
+           goal: np.ndarray, position: np.ndarray) -> tuple[Check | None, bool, float]:  # fmt: skip
     """Return what a joint's goals and positions contradict, None if it follows; whether it moves; and its lag [s]."""
     name, begin_s = names[i], -1.5 * found.sample_s
     moves = bool(min(s[i] for s in found.spread) > _STILL)
@@ -249,7 +259,7 @@ def _judge(found: Response, i: int, names: Sequence[str], by_name: bool, t_s: tu
     away = f"{name} is held at {level:.3g} by a goal of {held:.3g}: another sign, unit or zero"
     scale = f"{name} follows its goal (r {r:.2f}) with a slope of {slope:.3g}: unit or scale of one of them is wrong"
     before = f"{name} moves {-lead_s:.3g} s before its goal: names are exchanged, or the clocks do not agree"
-    checks: list[tuple[str, Weight, bool, str]] = [
+    table: list[tuple[str, Weight, bool, str]] = [
         ("copy", "refuse", copied,
          f"{name}: its goals are copies of its measurements, so they hold no information on the drive"),
         ("sign", "ask", is_elsewhere and abs(level + held) < 0.3 * abs(held), away),
@@ -270,7 +280,7 @@ def _judge(found: Response, i: int, names: Sequence[str], by_name: bool, t_s: tu
         ("sign", "ask", sign == 0, f"{name} fits its goal with either sign (r {r:.2f} and {against:.2f}): "
          "the motion repeats"),
     ]  # fmt: skip
-    wrong = next((Finding(kind, i, text, weight) for kind, weight, holds, text in checks if holds), None)
+    wrong = next((Check(name, i, text, weight) for name, weight, holds, text in table if holds), None)
     return wrong, moves, lag_s
 
 
@@ -286,7 +296,7 @@ def _clock(
     position: np.ndarray,
     joints: Sequence[int],
     acting: np.ndarray | None,
-) -> list[Finding]:
+) -> list[Check]:
     """Return a finding if the lag grows: two clocks run at different rates."""
     begin, end = max(t[0] for t in t_s), min(t[-1] for t in t_s)
     count = min(10, int((end - begin) / 3.0))
@@ -321,12 +331,12 @@ def _clock(
         "the clocks of the two streams run at different rates"
     )
     # The lag of a servo also changes with the frequency of a sweep, by less.
-    return [Finding("clock", -1, text, "refuse" if abs(grown) > 0.15 else "warn")]
+    return [Check("clock", -1, text, "refuse" if abs(grown) > 0.15 else "warn")]
 
 
 def _zero(
     t_s: tuple[np.ndarray, np.ndarray], goal: np.ndarray, position: np.ndarray, i: int, name: str, lag_s: float | None
-) -> list[Finding]:
+) -> list[Check]:
     """Return findings on a zero that steps, or an offset between goal and position.
 
     Args:
@@ -375,7 +385,7 @@ def _zero(
             leaps = any(abs(size) > 0.1 and 0.6 < (q[k] - q[k - 1]) / size < 1.6 for k, size in moved)
             listed = ", ".join(f"{size:+.3f} rad from {at[k] - t_s[1][0]:.2f} s on" for k, size in moved)
             text = f"{name} reads against its goal {listed}: one of them has another zero"
-            return [Finding("zero", i, text, "refuse" if leaps else "warn")]
+            return [Check("zero", i, text, "refuse" if leaps else "warn")]
     if lag_s is None:
         return []
     shift = max(round(lag_s / period_s), 0)
@@ -383,11 +393,11 @@ def _zero(
     offset = float(np.median(error))
     if abs(offset) > 0.05 and abs(offset) > 2.0 * float(np.median(np.abs(error - offset))):
         text = f"{name} reads {offset:+.3f} rad against its goal on average: zeros differ, or a load pulls"
-        return [Finding("zero", i, text, "ask" if abs(offset) > 1.0 else "warn")]
+        return [Check("zero", i, text, "ask" if abs(offset) > 1.0 else "warn")]
     return []
 
 
-def _rates(t_s: tuple[np.ndarray, np.ndarray], goal: np.ndarray, position: np.ndarray) -> list[Finding]:
+def _rates(t_s: tuple[np.ndarray, np.ndarray], goal: np.ndarray, position: np.ndarray) -> list[Check]:
     """Return a finding if one side is sampled too slowly for the motion of the other."""
     findings = []
     sides = ("goals", t_s[0], goal), ("positions", t_s[1], position)
@@ -406,7 +416,7 @@ def _rates(t_s: tuple[np.ndarray, np.ndarray], goal: np.ndarray, position: np.nd
                 f"{slow} the motion is unknown, so delays and dynamics cannot be identified; log {slow} at "
                 f"{4 * band:.0f} Hz"
             )
-            findings.append(Finding("rate", -1, text, "warn"))
+            findings.append(Check("rate", -1, text, "warn"))
     return findings
 
 
@@ -419,8 +429,8 @@ def _rate(t_s: np.ndarray, values: np.ndarray) -> float:
     return 1.0 / max(usual if regular else float(np.median(np.diff(t_s))), 1e-9)
 
 
-def _scales(position: np.ndarray, names: Sequence[str]) -> list[Finding]:
-    """Return a finding on a column that is far larger than the others and turns back, as one in another unit does."""
+def odd_columns(position: np.ndarray, names: Sequence[str]) -> list[Check]:
+    """Return a check on a column that is far larger than the others and turns back, as one in another unit does."""
     most = np.abs(position).max(axis=0)
     findings = []
     for i, size in enumerate(most):
@@ -428,7 +438,7 @@ def _scales(position: np.ndarray, names: Sequence[str]) -> list[Finding]:
         net = abs(position[-1, i] - position[0, i])
         if others.size and size > 1.0 and size > 8.0 * others.max() and net < 0.7 * np.ptp(position[:, i]):
             text = f"{names[i]} reads up to {size:.4g}, the other joints {others.max():.3g}: another unit or scale?"
-            findings.append(Finding("scale", i, text, "refuse" if size > TURN_RAD else "warn"))
+            findings.append(Check("scale", i, text, "refuse" if size > TURN_RAD else "warn"))
     return findings
 
 

@@ -312,7 +312,7 @@ def _keep_plausible(table: Table, name: str, field: str, node: NodeMapping, own:
     Raises:
         UsageError: When positions jump farther than a joint can move, and stay there.
     """
-    what, values = f"field {field} of node {name} in {table.path}", own.fields[field]
+    values = own.fields[field]
     t_s = own.rows / (node.rate_hz or 1.0)
     if own.stamps is not None:
         t_s = own.stamps[own.rows] * (STAMP_UNITS[node.stamp_unit] * 1e-9)
@@ -323,8 +323,10 @@ def _keep_plausible(table: Table, name: str, field: str, node: NodeMapping, own:
     # A jump without return means another zero, another unit or missing samples.
     if (jump := checks.leap(t_s[good], angle[good])) is not None:
         k, i, size = jump
+        sources = node.fields[field].sources
+        source = sources[i] if len(sources) == angle.shape[1] else f"{sources[0]}[:,{i}]"
         raise UsageError(
-            f"column {i} of {what} changes by {size:.4g} rad before sample {own.rows[good][k]}, within "
+            f"{source} in {table.path} changes by {size:.4g} rad before sample {own.rows[good][k]}, within "
             f"{t_s[good][k] - t_s[good][k - 1]:.3g} s: a joint cannot, so its zero or its unit has changed",
             hint="cut the file there with --samples A:B, correct the unit, or omit this joint",
         )

@@ -18,15 +18,18 @@ if TYPE_CHECKING:
 
 _SIDES = {
     "command": (
-        "cmd command commanded commands goal goals target targets told des desired ref reference setpoint sp action "
-        "actions ctrl control controls u ff feedforward"
+        "cmd cmds cmnd command commands commanded goal goals target targets tgt told des desired demand demanded "
+        "wanted ref reference setpoint set sp soll action actions ctrl control controls u ff feedforward"
     ),
-    "measured": "meas measured measurement state states actual present obs observation fb feedback sensor encoder",
+    "measured": (
+        "meas measured measurement mes msr state states actual present obs observation fb fbk feedback reading "
+        "readings sensor enc encoder estimate estimated est pv ist"
+    ),
 }
 _QUANTITIES = {
-    "stamp": "t time times stamp stamps timestamp timestamps sec secs date datetime",
-    "position": "q qs qpos pos position positions angle angles th theta",
-    "velocity": "dq qd qvel vel velocity velocities speed speeds omega thdot qdot rate_of_angle",
+    "stamp": "t time times stamp stamps timestamp timestamps sec secs seconds date datetime elapsed clock uptime",
+    "position": "q qs qj qpos pos jpos position positions ang angle angles th theta",
+    "velocity": "dq qd qvel vel velocity velocities speed speeds omega thdot qdot",
     "torque": "tau torque torques effort efforts load loads current currents force forces",
     "duty": "pwm duty",
     "voltage": "volt volts voltage vin",
@@ -53,11 +56,18 @@ _UNITS = {
     "m": "m meters metres",
     "percent": "percent pct normalized normalised hundredths",
 }
+_PHRASES = (
+    (r"%(?!time)", " percent "),
+    ("\N{DEGREE SIGN}", " deg "),
+    (r"(?i)\binput_(?=pos|vel)", "command_"),  # ODrive
+    (r"\b(d?q)_d_(?=[A-Za-z0-9])", r"\1_command_"),  # libfranka; q_d alone may be a joint d
+)
+"""Spellings of some makers -> words of the tables."""
 _WEAK_WORDS = {"state", "states"}
-_SIDE = {word: side for side, listed in _SIDES.items() for word in listed.split()}
-_QUANTITY = {word: quantity for quantity, listed in _QUANTITIES.items() for word in listed.split()}
-_UNIT = {word: unit for unit, listed in _UNITS.items() for word in listed.split()}
-_MEANINGLESS = "data entries msg log values value points motor motors per joint joints header field"
+_SIDE, _QUANTITY, _UNIT = (
+    {word: kind for kind, words in table.items() for word in words.split()} for table in (_SIDES, _QUANTITIES, _UNITS)
+)
+_MEANINGLESS = "data entries msg log values value points motor motors servo servos axis per joint joints header field"
 _FILLERS = set(_MEANINGLESS.split())
 """Parts of messages, and names of lists of records."""
 _WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
@@ -75,13 +85,11 @@ class Meaning:
 
 def meaning(name: str) -> Meaning:
     """Return the meaning of a name; ``cmd_deg/FL_hip`` is a command in degrees, of joint ``fl_hip``."""
+    for spelling, words_of_it in _PHRASES:
+        name = re.sub(spelling, words_of_it, name)
     quantity = unit = ""
     rest = []
-    words = [
-        word.lower() for word in _WORDS.findall(name.replace("%", " percent ").replace("\N{DEGREE SIGN}", " deg "))
-    ]
-    if name.startswith("%time"):
-        words = words[1:]
+    words = _words(name)[name.startswith("%time") :]
     for place, word in enumerate(words):
         # A letter is a unit only after another word, as in `t_s`; `s` alone is a name.
         known_unit = _UNIT.get(word, "") if place and (word != "m" or place == len(words) - 1) else ""
@@ -96,10 +104,20 @@ def meaning(name: str) -> Meaning:
             unit = known_unit
         elif word not in _FILLERS:
             rest.append(word)
+    if len(words) == 1 and len(words[0]) > 1 and _UNIT.get(words[0]) in ("s", "ms", "us", "ns"):  # such as `millis`
+        quantity, unit, rest = "stamp", _UNIT[words[0]], []
     # `dq_rad_s`: an angle over a time is a velocity, in the angle's unit.
     if quantity == "velocity" and unit == "s":
-        unit = next((u for w in words if (u := _UNIT.get(w, "")) in ("rad", "deg")), "")
-    return Meaning(_side(name), quantity, unit, "_".join(rest))
+        unit = next((u for w in words if (u := _UNIT.get(w, "")) in ("rad", "deg", "rev", "mrad", "m", "mm")), "")
+    side = _side(name)
+    if "act" in rest and not side:  # the actual position, or an action
+        side = "measured" if quantity else "command"
+        rest.remove("act")
+    return Meaning(side, quantity, unit, "_".join(rest))
+
+
+def _words(name: str) -> list[str]:
+    return [word.lower() for word in _WORDS.findall(name)]
 
 
 def _side(name: str) -> str:
@@ -108,7 +126,7 @@ def _side(name: str) -> str:
     ``/controller_state.reference.positions`` is a command, although its topic is a state.
     """
     for part in re.split(r"[./]", name)[::-1]:
-        words = [word for word in map(str.lower, _WORDS.findall(part)) if word in _SIDE]
+        words = [word for word in _words(part) if word in _SIDE]
         # `target_joint_state` and `state_desired` are commands, so "state" counts only without another word.
         strong = [word for word in words if word not in _WEAK_WORDS] or words
         if strong:
@@ -122,9 +140,9 @@ def about_torque(mapping: Mapping[str, Mapping[str, Json]]) -> list[str]:
     Args:
         mapping: Node -> its mapping, as in the metadata of an imported log.
     """
-    fields = [node["fields"].get("torque") for node in mapping.values()]
-    listed = [[f["source"]] if isinstance(f["source"], str) else f["source"] for f in fields if f]
-    sources = [f"'{name}'" for names in listed for name in names if meaning(name).side != "command"]
+    listed = [node["fields"]["torque"]["source"] for node in mapping.values() if "torque" in node["fields"]]
+    names = [name for source in listed for name in ([source] if isinstance(source, str) else source)]
+    sources = [f"'{name}'" for name in names if meaning(name).side != "command"]
     if not sources:
         return []
     return [
@@ -137,20 +155,26 @@ def about_torque(mapping: Mapping[str, Mapping[str, Json]]) -> list[str]:
 def is_unit(text: str) -> bool:
     """Return whether a text is a unit, such as ``rad/s``, ``[deg]`` or ``N m``."""
     words = [w.lower() for w in re.findall(r"[A-Za-z%]+", text)]
-    return bool(words) and all(w in _UNIT or w in ("n", "m", "nm", "a", "v", "%", "kg", "per", "mm") for w in words)
+    return bool(words) and all(w in _UNIT or w in ("n", "m", "nm", "a", "v", "%", "kg", "per") for w in words)
+
+
+# -- joints
 
 
 def are_numbers(labels: Sequence[str]) -> bool:
     """Return whether labels are the numbers of joints, not their names: ``3``, or ``m_3``, with one letter for all."""
-    found = [re.fullmatch(r"([a-z]?)_?\d+", label) for label in labels]
+    found = [re.fullmatch(r"([a-z]?)_?\d+", meaning(label).label) for label in labels]
     return None not in found and len({match[1] for match in found if match}) == 1
 
 
 def same_joint(label: str, joint: str) -> bool:
     """Return whether a column's label is the name of a model's joint, as ``fl_hip`` is of ``FL_hip_joint``."""
-    words = [w.lower() for w in _WORDS.findall(joint)]
-    named = meaning(joint).label
-    return bool(label) and label in ("_".join(words), "_".join(w for w in words if w not in _FILLERS), named)
+    return bool(_spellings(label) & _spellings(joint))
+
+
+def _spellings(joint: str) -> set[str]:
+    words = _words(joint)
+    return {"_".join(words), "_".join(w for w in words if w not in _FILLERS), meaning(joint).label} - {""}
 
 
 def columns_of(joints: Sequence[str], labels: Sequence[str]) -> tuple[list[int], str] | None:
@@ -162,44 +186,39 @@ def columns_of(joints: Sequence[str], labels: Sequence[str]) -> tuple[list[int],
     exact = [[i for i, label in enumerate(labels) if same_joint(label, joint)] for joint in joints]
     if all(len(found) == 1 for found in exact):
         return [found[0] for found in exact], "by name"
-    legs = _by_leg(joints), _by_leg(labels)
-    if legs[0] is None or legs[1] is None or len(set(legs[0])) < len(joints) or len(set(legs[1])) < len(labels):
+    own, theirs = _legs(joints), _legs(labels)
+    if not own or not theirs or len(set(own)) < len(joints) or len(set(theirs)) < len(labels):
         return None
-    if not set(legs[0]) <= set(legs[1]):
-        return None
-    return [legs[1].index(at) for at in legs[0]], "by leg and part"
+    return ([theirs.index(at) for at in own], "by leg and part") if set(own) <= set(theirs) else None
 
 
-def _by_leg(names: Sequence[str]) -> list[tuple[str, int]] | None:
-    """Return leg and number of the part, 0 for the hip, of each name; None if one has no leg or no part."""
+def _legs(names: Sequence[str]) -> list[tuple[str, int]]:
+    """Return leg and number of the part, 0 for the hip, of each name; nothing if one has no leg or no part."""
     legs: list[str] = []
     parts: list[str] = []
     either = "|".join(_LEGS)
     for name in names:
-        words = [w.lower() for w in _WORDS.findall(name)]
-        text = "".join(_LEG_WORDS.get(w) or w for w in words if w not in _FILLERS and w != "leg")
+        text = "".join(_LEG_WORDS.get(w) or w for w in _words(name) if w not in _FILLERS and w != "leg")
         match = re.fullmatch(f"({either})(.+)|(.+)({either})", text)
         if match is None:
-            return None
+            return []
         legs.append(_LEGS[match[1] or match[4]])
         parts.append(match[2] or match[3])
     if not any(part.isdigit() for part in parts):
-        return None if set(parts) - set(_PART) else [(leg, _PART[p]) for leg, p in zip(legs, parts, strict=True)]
+        return [] if set(parts) - set(_PART) else [(leg, _PART[p]) for leg, p in zip(legs, parts, strict=True)]
     # Numbers count from 0 or from 1, in each leg alike.
-    if not all(part.isdigit() for part in parts):
-        return None
-    numbers = [int(part) for part in parts]
-    if min(numbers) > 1 or len(set(legs)) * len(set(numbers)) != len(names):
-        return None
+    numbers = [int(part) if part.isdigit() else -1 for part in parts]
+    if not 0 <= min(numbers) <= 1 or len(set(legs)) * len(set(numbers)) != len(names):
+        return []
     return [(leg, n - min(numbers)) for leg, n in zip(legs, numbers, strict=True)]
 
 
 _LEG_WORDS = {"front": "f", "fore": "f", "rear": "r", "hind": "r", "back": "r", "left": "l", "right": "r"}
 _LEGS = {
-    "fl": "fl", "fr": "fr", "rl": "rl", "rr": "rr", "lf": "fl", "rf": "fr", "lh": "rl", "rh": "rr",
-    "hl": "rl", "hr": "rr",
-    "lr": "rl", "lb": "rl", "rb": "rr", "bl": "rl", "br": "rr",
-}  # fmt: skip
+    word: leg
+    for leg, words in {"fl": "fl lf", "fr": "fr rf", "rl": "rl lh hl lr lb bl", "rr": "rr rh hr rb br"}.items()
+    for word in words.split()
+}
 _PART = {
     word: number
     for number, words in enumerate(("hip haa abad abduction abduct hipx hx coxa", "thigh hfe upper hipy hy femur",
@@ -220,6 +239,7 @@ class Signal:
         labels: Joint of each column; empty if its name has none.
         values: Shape ``(N, columns)``; ``(columns,)`` for constants.
         whole: Source of all columns together; empty if they are separate signals of the file.
+        stream: The topic in a bag, or the file of one of several; empty for others.
     """
 
     sources: tuple[str, ...]
@@ -227,6 +247,7 @@ class Signal:
     meaning: Meaning
     values: np.ndarray
     whole: str = ""
+    stream: str = ""
 
     @property
     def name(self) -> str:
@@ -236,17 +257,11 @@ class Signal:
     def width(self) -> int:
         return len(self.sources)
 
-    @property
-    def stream(self) -> str:
-        """The topic of a signal in a bag, or the file of one of several; empty for others."""
-        key = self.sources[0]
-        return key.partition(".")[0] if key.startswith("/") else key.partition("/")[0] if "/" in key else ""
-
     def taken(self, places: Sequence[int]) -> Signal:
         """Return some of the columns, in this order."""
         whole = self.whole if list(places) == list(range(self.width)) else ""
         sources, labels = (tuple(part[i] for i in places) for part in (self.sources, self.labels))
-        return Signal(sources, labels, self.meaning, self.values[..., list(places)], whole)
+        return replace(self, sources=sources, labels=labels, values=self.values[..., list(places)], whole=whole)
 
     def mapped(self, unit: str) -> FieldMapping:
         """Return the field that has these columns."""
@@ -274,7 +289,7 @@ def collect(table: Table) -> tuple[list[Signal], list[str]]:
     alike: dict[tuple[Meaning, tuple[int, ...], str], list[Signal]] = {}
     signals: list[Signal] = []
     for key, raw in table.columns.items():
-        named, values = _meaning(key, table), raw.astype(np.float64)
+        named, values, stream = _meaning(key, table), raw.astype(np.float64), _stream(key, table)
         if values.ndim > 2 or (values.ndim == 2 and values.shape[1] > 1000):
             notes.append(f"skipped: {key!r} has samples of shape {values.shape[1:]}, as images have")
         elif values.size and not np.isfinite(values).any():
@@ -282,22 +297,24 @@ def collect(table: Table) -> tuple[list[Signal], list[str]]:
         elif values.ndim == 2:
             n = values.shape[1]
             names = table.names.get(key) or _names_of(key, n, lists, table)
-            labels = tuple(meaning(x).label or x.lower() for x in names) if len(names) == n else ("",) * n
-            signals.append(Signal(tuple(f"{key}[:,{i}]" for i in range(n)), labels, named, values, key))
+            labels = tuple(map(_joint_of, names)) if len(names) == n else ("",) * n
+            if named.label == "d" and named.quantity:  # q_d of libfranka
+                named = replace(named, side="command")
+            signals.append(Signal(tuple(f"{key}[:,{i}]" for i in range(n)), labels, named, values, key, stream))
         else:
-            row = Signal((key,), (_label(key, named, table),), named, values[..., None])
-            alike.setdefault((replace(named, label=""), values.shape, row.stream), []).append(row)
-    for (named, _, _), rows in alike.items():
-        labels = [row.labels[0] for row in rows]
+            row = Signal((key,), (_label(key, named, table),), named, values[..., None], stream=stream)
+            alike.setdefault((replace(named, label=""), values.shape, stream), []).append(row)
+    for (named, _, stream), rows in alike.items():
+        labels = tuple(row.labels[0] for row in rows)
         numbered = are_numbers(labels)
         together = len(set(labels)) == len(labels) > 1 and "" not in labels and named.quantity != "stamp"
         if not together or not (named.side or named.quantity or numbered):
             signals += rows
             continue
-        if numbered:
-            rows.sort(key=lambda row: int(re.findall(r"\d+", row.labels[0])[0]))
         values = np.concatenate([row.values for row in rows], axis=-1)
-        signals.append(Signal(tuple(r.sources[0] for r in rows), tuple(r.labels[0] for r in rows), named, values))
+        found = Signal(tuple(r.sources[0] for r in rows), labels, named, values, stream=stream)
+        numbers = [int(re.findall(r"\d+", label)[0]) for label in labels] if numbered else []
+        signals.append(found.taken(np.argsort(numbers, kind="stable").tolist()) if numbered else found)
     return signals, notes
 
 
@@ -308,13 +325,25 @@ def _meaning(key: str, table: Table) -> Meaning:
     return named if named.side or not stem else replace(named, side=meaning(stem).side)
 
 
+def _stream(key: str, table: Table) -> str:
+    if table.format == "mcap":
+        return key.partition(".")[0]
+    return next((stem for stem in table.stems if key.startswith(stem)), "")
+
+
 def _label(key: str, named: Meaning, table: Table) -> str:
     """Return a column's joint; ``position0`` is that of the name in ``name0``, as rostopic writes it."""
     if match := re.fullmatch(r"(.*?)[a-z]+(\d+)", key):
         words = table.words.get(f"{match[1]}name{match[2]}", [])
         if words and len(set(words)) == 1:
-            return meaning(words[0]).label or words[0].lower()
+            return _joint_of(words[0])
     return named.label
+
+
+def _joint_of(name: str) -> str:
+    """Return a joint of a list of names: ``shoulder.pos`` is of ``shoulder``, others are kept as they are."""
+    named = meaning(name)
+    return named.label or name if named.side or named.quantity or named.unit else name
 
 
 def _names_joints(key: str, words: Sequence[str]) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,8 +27,14 @@ from sim2real.log.importing.mapping import (
 from sim2real.log.importing.names import Meaning, Signal, about_torque, are_numbers, collect, columns_of, meaning
 from sim2real.log.importing.readers import Table
 
-_FIELDS = {"position": "goal", "velocity": "goal_velocity", "torque": "torque", "duty": "duty", "voltage": "duty"}
-"""Quantity of commands -> field."""
+_FIELDS = {
+    "position": ("goal", ""),
+    "velocity": ("goal_velocity", "rad/s"),
+    "torque": ("torque", "N m"),
+    "duty": ("duty", ""),
+    "voltage": ("duty", "V"),
+}
+"""Quantity of commands -> field and unit."""
 _EXTRA = {
     "kp": ("kp", None, ""),
     "kd": ("kd", None, ""),
@@ -38,11 +44,18 @@ _EXTRA = {
     "payload_reach": ("reach", None, "m"),
 }
 """Commands beside a goal: field -> quantity, side or None for any, and unit."""
+_KNOWN_UNITS = (
+    (r"joint_?(state|command)s?|field\.(position|header)", "messages of ROS are in radians"),
+    (r"qpos|dof_?pos", "MuJoCo and Isaac are in radians"),
+    (r"(actual|target)_q(?![a-z])", "RTDE of Universal Robots is in radians"),
+    (r"motor_?(state|cmd)", "Unitree's messages are in radians"),
+)
+"""Names of whole families that are in radians, and the evidence."""
+_OF_SLIDES = {"rad": "m", "rad/s": "m/s", "N m": "N"}
 _RATES_HZ = (5.0, 12_000.0)
 """Usual sampling rates of recorders."""
 _WALL_S = (1e9, 4e9)
 """Wall clocks read this many seconds since 1970 (2001 to 2096)."""
-
 _APART_S = 0.02
 """Two clocks of one topic that disagree by more are a question."""
 
@@ -101,7 +114,7 @@ class Proposal:
         self.reasons: dict[Key, str] = {}
         self.questions: dict[Key, str] = {}
         self.evidence = [*table.notes, *notes]
-        self.unnamed: tuple[str, str] | None = None  # node and field whose unit is that of the other side
+        self.fields: dict[str, dict[str, FieldMapping]] = {"actuator": {}, "sensor": {}}
 
     def toml(self) -> str:
         """Return the text of the mapping file."""
@@ -126,45 +139,50 @@ class Proposal:
         places, self.joints = self.joint_order(measured)
         measured = measured.taken(places)
         command, by_name = self.matched(command, measured, places)
-        # Their clocks, units, and what goes along.
+        # Their clocks and units. A unit of one side holds for the other, and the data must agree.
         sides = {"actuator": command, "sensor": measured}
         clocks = {node: self.clock(signal, node) for node, signal in sides.items()}
         kind = command.meaning.quantity or "position"
-        goal = _FIELDS[kind]
-        fields: dict[str, dict[str, FieldMapping]] = {"actuator": {}, "sensor": {}}
+        field, unit = _FIELDS[kind]
         angles = {("sensor", "position"): measured}
         if kind == "position":
-            angles["actuator", goal] = command
+            angles["actuator", field] = command
         else:
-            unit = {"velocity": "rad/s", "torque": "N m", "voltage": "V"}.get(kind, "")
-            fields["actuator"][goal] = command.mapped(unit)
-            self.reasons["actuator", goal, "source"] = f"commands {kind}, by its name"
+            self.fields["actuator"][field] = command.mapped(unit)
+            self.reasons["actuator", field, "source"] = f"commands {kind}, by its name"
         units = {at: self.unit(signal) for at, signal in angles.items()}
         known = {unit for unit, _ in units.values() if unit}
+        unproven = None
         for at, signal in angles.items():
             if not any(units[at]) and len(known) == 1:
-                self.unnamed = at
+                unproven = at
                 units[at] = next(iter(known)), "as of the other side: its own name has none"
-            fields[at[0]][at[1]] = self.angle(at, signal, *units[at])
-        self.add_extras(command, measured, places, fields)
-        self.add_velocities(command, measured, places, fields, clocks)
-        nodes = {node: NodeMapping(self.in_lengths(fields[node]), **clocks[node][0]) for node in sides}
+            self.fields[at[0]][at[1]] = self.angle(at, signal, *units[at])
+        # What goes along.
+        self.add_extras(command, measured, places)
+        self.add_velocities(command, measured, places, {node: t_s for node, (_, t_s) in clocks.items()})
+        nodes = {node: NodeMapping(self.in_lengths(self.fields[node]), **clocks[node][0]) for node in sides}
         self.mapping = ImportMapping(self.hints.pipeline, nodes)
         self.evidence += about_torque({n: msgspec.to_builtins(node) for n, node in nodes.items()})
         self.add_unused()
+        # What the data say.
         if not self.questions:
             try:
                 episode = import_table(self.table, self.mapping)
             except UsageError as error:
-                if self.unnamed is None:
+                values = measured.values[np.isfinite(measured.values).all(axis=1)]
+                odd = checks.odd_columns(in_si(self.fields["sensor"]["position"].unit)[0] * values, self.joints)
+                if odd:
+                    raise UsageError(f"{self.table.path}: {odd[0].text}", hint=checks.hint_for(odd)) from None
+                if unproven is None:
                     raise
-                self.ask_unit(str(error).partition("\n")[0])
+                self.ask_unit(unproven, str(error.args[0]))
                 return
             source = episode.metadata["source"]
             for node, counts in source["dropped"].items():
                 self.evidence += [f"{node}: left out {n} samples: {why}" for why, n in counts.items()]
             self.evidence += [f"turns of {field} are counted" for field in source["turns"]]
-            self.weigh(checks.check_episode(episode, self.joints, by_name), fields["actuator"].get("goal"))
+            self.weigh(checks.check_episode(episode, self.joints, by_name), unproven or ("actuator", "goal"))
 
     # -- positions, commands, and their joints
 
@@ -194,11 +212,10 @@ class Proposal:
                 f"{'; '.join([', '.join(self.table.keys[:40]) or 'none', *self.evidence[:5]])}",
                 hint="name them by quantity and joint, such as q_hip_rad and goal_hip_rad, or write a mapping",
             )
-        at, what = (
-            (("sensor", "position", "source"), "which are the measured positions")
-            if side == "measured"
-            else (("actuator", "goal", "source"), "which commands drove the joints")
-        )
+        at, what = {
+            "measured": (("sensor", "position", "source"), "which are the measured positions"),
+            "command": (("actuator", "goal", "source"), "which commands drove the joints"),
+        }[side]
         self.questions[at] = f"{' or '.join(map(_written, choices[:12]))}?  # {what}: names do not say"
         return choices[0]
 
@@ -206,10 +223,10 @@ class Proposal:
         """Return the column of each joint of the robot, and the joints' names."""
         labels, joints, at = measured.labels, self.hints.joints, ("sensor", "position", "source")
         if not joints:
-            finite = np.asarray(np.isfinite(measured.values).any(axis=0))
+            finite = np.isfinite(measured.values).any(axis=0).tolist()
             if empty := [source for source, good in zip(measured.sources, finite, strict=True) if not good]:
                 self.evidence.append(f"skipped: {', '.join(empty)} has no number in any sample")
-            kept = np.flatnonzero(finite).tolist()
+            kept = [i for i, good in enumerate(finite) if good]
             return kept, tuple(labels[i] or str(i) for i in kept)
         if any(labels) and (found := columns_of(joints, labels)) is not None:
             places, self.reasons[at] = found
@@ -268,30 +285,31 @@ class Proposal:
     def clock(self, of: Signal, node: str) -> tuple[dict[str, Any], np.ndarray]:
         """Return the keys of a node's clock, and its stamps [s]."""
         count = len(of.values)
-        if self.hints.rate_hz is not None:
-            self.reasons[node, "", "rate_hz"] = "--rate-hz"
-            return {"rate_hz": self.hints.rate_hz}, np.arange(count) / self.hints.rate_hz
         named = [s for s in self.signals if s.meaning.quantity == "stamp" and s.values.shape == (count, 1)]
         fitting = [s for s in named if _increases(s.values[:, 0])]
+        if self.hints.rate_hz is not None or not fitting:
+            return self.generated_clock(named, count, node)
         # Prefer the stamps of the signal's own topic or file, then those of its side; in a topic, the header's.
         side = of.meaning.side or ("command" if node == "actuator" else "measured")
-        chosen = [s for s in fitting if of.stream and s.stream == of.stream]
-        chosen = chosen or [s for s in fitting if s.meaning.side == side] or [s for s in fitting if not s.meaning.side]
-        chosen = chosen or fitting
-        header = [s for s in chosen if s.name.endswith("header.stamp")] or [
-            s for s in chosen if s.name.endswith("stamp")
-        ]
+        groups = (
+            [s for s in fitting if of.stream and s.stream == of.stream],
+            [s for s in fitting if s.meaning.side == side],
+            [s for s in fitting if not s.meaning.side],
+            fitting,
+        )
+        chosen = next(group for group in groups if group)
+        header = next(
+            (h for end in ("header.stamp", "stamp") if (h := [s for s in chosen if s.name.endswith(end)])), []
+        )
         log = [s for s in chosen if s.name.endswith(".log_time")]
         apart_s = _apart_s(header[0].values[:, 0], log[0].values[:, 0]) if header and log else 0.0
+        chosen = header or chosen
         if apart_s > _APART_S:
             self.questions[node, "", "stamps"] = (
                 f'"{header[0].name}" or "{log[0].name}"?  # the sender\'s clock and the recorder\'s drift apart by '
                 f"{apart_s:.2g} s: one of them steps, or runs at another rate"
             )
-        chosen = header or chosen
-        if not chosen:
-            return self.generated_clock(named, count, node)
-        if len(chosen) > 1:
+        elif len(chosen) > 1:
             listed = " or ".join(f'"{s.name}"' for s in chosen)
             what = "commands" if side == "command" else "positions"
             self.questions[node, "", "stamps"] = f"{listed}?  # which clock has stamped the {what}"
@@ -304,16 +322,19 @@ class Proposal:
         return keys, values * STAMP_UNITS[unit or "s"] * 1e-9
 
     def generated_clock(self, named: Sequence[Signal], count: int, node: str) -> tuple[dict[str, Any], np.ndarray]:
-        """Return the keys and stamps of a node without a clock: by a rate in the file, or a question."""
-        for s in self.signals:
+        """Return the keys and stamps of a node without a clock: by the flag, a rate in the file, or a question."""
+        rate_hz, reason = self.hints.rate_hz, "--rate-hz"
+        for s in self.signals if rate_hz is None else ():
             if s.values.shape == (1,) and s.values[0] > 0 and s.meaning.quantity in ("rate", "period"):
                 value = float(s.values[0])
                 rate_hz = value if s.meaning.quantity == "rate" else 1.0 / (value * (1.0 if value < 1.0 else 1e-3))
-                self.reasons[node, "", "rate_hz"] = f"{s.name!r} in the file"
-                return {"rate_hz": rate_hz}, np.arange(count) / rate_hz
-        why = f"the stamps {named[0].name!r} repeat or step back" if named else "the file has no time stamps"
-        self.questions[node, "", "rate_hz"] = f"?  # samples per second: {why}; --rate-hz answers, too"
-        return {"rate_hz": 1.0}, np.arange(float(count))
+                reason = f"{s.name!r} in the file"
+                break
+        if rate_hz is None:
+            why = f"the stamps {named[0].name!r} repeat or step back" if named else "the file has no time stamps"
+            self.questions[node, "", "rate_hz"] = f"?  # samples per second: {why}; --rate-hz answers, too"
+        self.reasons[node, "", "rate_hz"] = reason
+        return {"rate_hz": rate_hz or 1.0}, np.arange(count) / (rate_hz or 1.0)
 
     # -- units
 
@@ -342,10 +363,9 @@ class Proposal:
                 return unit, "whole counts by LeRobot's calibration"
             return "", '"deg" or "hundredths" (with --calibration)?'
         key = (signal.whole or signal.sources[0]).lower()
-        if self.table.format == "mcap" or re.search(r"joint_?(state|command)s?|field\.(position|header)", key):
-            return "rad", "messages of ROS are in radians"
-        if re.search(r"qpos|dof_?pos", key):
-            return "rad", "MuJoCo and Isaac are in radians"
+        for pattern, reason in _KNOWN_UNITS:
+            if self.table.format == "mcap" or re.search(pattern, key):
+                return "rad", reason
         if self.hints.slides:
             only = len(self.hints.slides) == len(self.hints.joints)
             return "", '"m" or "mm"?' if only else '"rad" (and m) or another?'
@@ -357,74 +377,71 @@ class Proposal:
             self.reasons[(*at, "unit")] = reason
         else:
             span = (np.nanmax(signal.values, axis=0) - np.nanmin(signal.values, axis=0)).max()
-            choices = reason or '"rad" or "deg"?'
             self.questions[(*at, "unit")] = (
-                f"{choices}  # it spans up to {span:.4g}, and its name has no unit; --unit answers, too"
+                f'{reason or """"rad" or "deg"?"""}  # it spans up to {span:.4g}, and its name has no unit; --unit '
+                "answers, too"
             )
         if self.hints.calibration is not None and unit in lerobot.UNITS:
             scale, offset = lerobot.conversion(self.hints.calibration, signal.labels, unit)
             return msgspec.structs.replace(signal.mapped("rad"), scale=tuple(scale), offset=tuple(offset))
         return signal.mapped(unit)
 
-    def in_lengths(self, fields: Mapping[str, FieldMapping]) -> dict[str, FieldMapping]:
+    def in_lengths(self, fields: dict[str, FieldMapping]) -> dict[str, FieldMapping]:
         """Return fields with the units of slides: lengths, or none where a robot has hinges and slides."""
-        found, slides = dict(fields), self.hints.slides
+        slides = self.hints.slides
+        found = dict(fields)
         for name, how in fields.items() if slides else ():
-            si = how.log_unit
-            length = {"rad": "m", "rad/s": "m/s", "N m": "N"}.get(si)
-            if length is not None and how.unit != si:
-                raise UsageError(
-                    f"{', '.join(how.sources)} is in {how.unit}, but {', '.join(slides)} slides",
-                    hint="write a mapping with the scales to m and to rad: 0.001 for mm, 0.0174533 for degrees",
-                )
-            if length is not None:
-                unit = length if len(slides) == len(self.hints.joints) else ""
+            if how.log_unit in _OF_SLIDES:
+                if how.unit != how.log_unit:
+                    raise UsageError(
+                        f"{', '.join(how.sources)} is in {how.unit}, but {', '.join(slides)} slides",
+                        hint="write a mapping with the scales to m and to rad: 0.001 for mm, 0.0174533 for degrees",
+                    )
+                unit = _OF_SLIDES[how.log_unit] if len(slides) == len(self.hints.joints) else ""
                 found[name] = msgspec.structs.replace(how, unit=unit)
         return found
 
     # -- what goes along, and what is left out
 
-    def add_extras(
-        self, command: Signal, measured: Signal, places: Sequence[int], fields: dict[str, dict[str, FieldMapping]]
-    ) -> None:
+    def add_extras(self, command: Signal, measured: Signal, places: Sequence[int]) -> None:
         """Add gains, torque on or off, further commands and payload, by their names."""
         for name, (quantity, side, unit) in _EXTRA.items():
             listed = [
                 s for s in self.signals
-                if s.meaning.quantity == quantity and s is not command and s is not measured
+                if s.meaning.quantity == quantity and not set(s.sources) & {*command.sources, *measured.sources}
                 and side in (None, s.meaning.side) and (s.values.ndim == 1 or len(s.values) == len(command.values))
             ]  # fmt: skip
-            if len(listed) != 1 or name in fields["actuator"]:
+            if len(listed) != 1 or name in self.fields["actuator"]:
                 continue
             chosen = _in_order(listed[0], measured, places)
-            if chosen is None:
-                continue
-            if not np.nan_to_num(chosen.values).any() and not name.startswith("payload"):
+            if chosen is not None and not np.nan_to_num(chosen.values).any() and not name.startswith("payload"):
                 self.evidence.append(f"{chosen.name!r} is 0 throughout: omitted")
-                continue
-            fields["actuator"][name] = chosen.mapped(unit)
-            self.reasons["actuator", name, "source"] = "by its name"
+            elif chosen is not None:
+                self.fields["actuator"][name] = chosen.mapped(unit)
+                self.reasons["actuator", name, "source"] = "by its name"
 
     def add_velocities(
-        self, command: Signal, measured: Signal, places: Sequence[int], fields: dict[str, dict[str, FieldMapping]],
-        clocks: Mapping[str, tuple[dict[str, Any], np.ndarray]],
-    ) -> None:  # fmt: skip
+        self, command: Signal, measured: Signal, places: Sequence[int], t_s: dict[str, np.ndarray]
+    ) -> None:
         """Add velocities that are the rate of their positions, or of their goals."""
+        sides = {
+            True: ("actuator", "goal_velocity", "goal", command),
+            False: ("sensor", "velocity", "position", measured),
+        }
         for s in self.signals:
             if s.meaning.quantity != "velocity" or s.values.ndim != 2 or s.sources == command.sources:
                 continue
-            goal, v = s.meaning.side == "command", _in_order(s, measured, places)
-            node, name, of = ("actuator", "goal_velocity", command) if goal else ("sensor", "velocity", measured)
-            how = fields[node].get("goal" if goal else "position")
-            if v is None or how is None or name in fields[node] or v.values.shape != of.values.shape:
+            node, name, base, of = sides[s.meaning.side == "command"]
+            how, v = self.fields[node].get(base), _in_order(s, measured, places)
+            if v is None or how is None or name in self.fields[node] or not isinstance(how.scale, float):
                 continue
-            if not isinstance(how.scale, float):
+            if v.values.shape != of.values.shape:
                 continue
             # Its unit is that of its name, else that of the positions; the data must agree.
             unit = f"{s.meaning.unit or how.unit}/s"
             angle = checks.counted(in_si(how.unit)[0] * of.values, checks.TURN_RAD)
-            if checks.is_rate(clocks[node][1], angle, in_si(unit)[0] * v.values):
-                fields[node][name] = v.mapped(unit)
+            if checks.is_rate(t_s[node], angle, in_si(unit)[0] * v.values):
+                self.fields[node][name] = v.mapped(unit)
                 self.reasons[node, name, "unit"] = f"it is the rate of {of.name!r}"
             else:
                 self.evidence.append(f"{s.name!r} is not the rate of {of.name!r}: omitted")
@@ -436,8 +453,7 @@ class Proposal:
         }
         left = [
             s.name for s in self.signals
-            if s.meaning.quantity in ("", "position", "velocity", "torque", "duty", "voltage")
-            and (s.meaning.side or s.meaning.quantity)
+            if s.meaning.quantity in ("", *_FIELDS) and (s.meaning.side or s.meaning.quantity)
             and not {s.whole, *s.sources} & used and not any(s.name in line for line in self.evidence)
         ]  # fmt: skip
         if left:
@@ -445,47 +461,47 @@ class Proposal:
 
     # -- what the data say
 
-    def weigh(self, findings: Sequence[checks.Finding], goal: FieldMapping | None) -> None:
-        """Refuse what contradicts the mapping, and ask what fits several mappings."""
-        self.evidence += [f.text for f in findings if f.weight == "note"]
+    def weigh(self, findings: Sequence[checks.Check], asked: tuple[str, str]) -> None:
+        """Refuse what contradicts the mapping, and ask what fits several mappings.
+
+        Args:
+            asked: Node and field whose unit is open where no position follows its goal.
+        """
         open_ones = [f for f in findings if f.weight in ("ask", "refuse")]
         told = [f for f in findings if f.weight == "warn"] + (open_ones if self.hints.as_told else [])
+        self.evidence += [f.text for f in findings if f.weight == "note"]
         self.evidence += [f"warning: {f.text}" for f in told]
         if self.hints.as_told:
             return
         # One line of the mapping answers these; the others are wrong in the file.
         # A joint of another scale than the others is refused by its name; if all are, their unit is open.
-        keys = {"sign": "scale", "order": "source", "slope": "unit", "follows": "unit"}
-        followed = any(f.kind == "follows" and f.weight == "note" for f in findings)
-        wrong = [
-            f for f in open_ones if f.kind not in keys or (f.kind == "slope" and f.weight == "refuse" and followed)
-        ]
+        followed = any(f.name == "follows" and f.weight == "note" for f in findings)
+        wrong = [f for f in open_ones if not f.question or (f.name == "slope" and f.weight == "refuse" and followed)]
         if wrong:
             text = "; ".join(f.text for f in wrong)
             raise UsageError(f"{self.table.path}: {text}", hint=checks.hint_for(wrong))
-        if goal is None:
-            return
-        scale = np.broadcast_to(goal.scale, (len(self.joints),)).tolist()
-        against = {f.joint for f in open_ones if f.kind == "sign"}
-        candidates = {
-            "scale": f"{[-x if i in against else x for i, x in enumerate(scale)]} or {scale}?",
-            "source": f"{json.dumps(goal.sources)} in another order?",
-        }
-        for key in dict.fromkeys(keys[f.kind] for f in open_ones):
-            asked = [f for f in open_ones if keys[f.kind] == key]
-            why = "; ".join(f.text for f in asked)
-            if self.hints.unit and all(f.kind == "follows" for f in asked):
+        goal = self.fields["actuator"].get("goal")
+        for key in dict.fromkeys(f.question for f in open_ones) if goal is not None else ():
+            those = [f for f in open_ones if f.question == key]
+            why = "; ".join(f.text for f in those)
+            if self.hints.unit and all(f.name == "follows" for f in those):
                 self.evidence.append(f"warning: {why}")  # --unit has answered
             elif key == "unit":
-                self.ask_unit(f"{why}; --as-told keeps it")
+                self.ask_unit(asked, f"{why}; --as-told keeps it")
+            elif key == "scale":
+                scale = np.broadcast_to(goal.scale, (len(self.joints),)).tolist()
+                turned = [-x if i in {f.joint for f in those} else x for i, x in enumerate(scale)]
+                self.questions["actuator", "goal", key] = f"{turned} or {scale}?  # {why}; --as-told keeps the file's"
             else:
-                self.questions["actuator", "goal", key] = f"{candidates[key]}  # {why}; --as-told keeps the file's"
+                listed = json.dumps(goal.sources)
+                self.questions["actuator", "goal", key] = (
+                    f"{listed} in another order?  # {why}; --as-told keeps the file's"
+                )
 
-    def ask_unit(self, why: str) -> None:
-        """Ask for a unit that no name gives, or else for that of the goals."""
-        node, name = self.unnamed or ("actuator", "goal")
-        unit = self.mapping.nodes[node].fields[name].unit
-        self.questions[node, name, "unit"] = f'"{unit}" or another?  # {why}; --unit answers, too'
+    def ask_unit(self, at: tuple[str, str], why: str) -> None:
+        """Ask for a unit that the data do not prove."""
+        unit = self.mapping.nodes[at[0]].fields[at[1]].unit
+        self.questions[(*at, "unit")] = f'"{unit}" or another?  # {why}; --unit answers, too'
 
 
 def _rank(named: Meaning, side: str) -> int | None:
@@ -571,14 +587,13 @@ def joint_motion(table: Table, joints: Sequence[str], unit: str) -> tuple[np.nda
         found = columns_of(joints, s.labels) if any(s.labels) else None
         alone = len(joints) == 1 and s.width == 1 and s.meaning.side == "command"
         if found is not None or alone:
-            order = (s.meaning.side != "command", s.meaning.quantity != "position", len(motions))
-            motions.append((*order, s.taken(found[0] if found else [0])))
+            motions.append(s.taken(found[0] if found else [0]))
     if not motions:
         raise UsageError(
             f"{table.path} has no columns for {', '.join(joints)}. Columns: {', '.join(table.keys[:30]) or 'none'}",
             hint=f"name them by joint, quantity and unit, such as {joints[0]}_goal_rad, and the time t_s",
         )
-    signal = min(motions)[3]
+    signal = min(motions, key=lambda s: (s.meaning.side != "command", s.meaning.quantity != "position"))
     _, t_s = of.clock(signal, "motion")
     own = of.unit(signal)[0] if unit == "rad" else unit
     if not own:

@@ -200,7 +200,11 @@ def open_tables(path: Path, episode: int | None = None) -> list[Table]:
             f"{path} is {'UTF-16 text' if is_utf_16 else 'binary'}, which import does not read",
             hint="save it as UTF-8 CSV, JSON, npz, Parquet or MCAP",
         )
-    text = path.read_text(encoding="utf-8-sig", errors="replace")
+    data = path.read_bytes()
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError:  # such as the degree sign of a program on Windows
+        text = data.decode("cp1252", errors="replace")
     return [_read_json(path, text) if text.lstrip()[:1] in ("{", "[") else _read_csv(path, text)]
 
 
