@@ -203,6 +203,16 @@ def test_help_shows_the_flags_that_a_user_sets_and_all_on_request(capsys, all_fl
     assert not {"(default: None)", "╭"} & set(lines)
 
 
+def test_all_commands_together_show_forty_flags(capsys):
+    """A flag of a stage counts once, also where `run` has it with a prefix."""
+    shown = set()
+    for command in cli.COMMANDS:
+        assert cli.main([command, "--help"]) == 0
+        names = re.findall(r"^  --([\w.-]+)", capsys.readouterr().out, re.MULTILINE)
+        shown |= {name.rpartition(".")[2] for name in names}
+    assert len(shown) <= 40, sorted(shown)
+
+
 def test_a_range_replaces_one_of_the_pipeline_or_is_added_to_them(calls):
     ranges = ["--vary.range", "roughness", "0", "0.04", "--vary.range", "payload", "-2", "3"]
     assert cli.main(["train", "go2", *ranges]) == 0

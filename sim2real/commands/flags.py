@@ -20,6 +20,8 @@ from sim2real.stages.flag import Flag
 Config = TypeVar("Config")
 _SHOWN: Mapping[str, str] = {
     "StageFlags": "config runs run",
+    "DemoFlags": "seed runs resume",
+    "PlayConfig": "source command duration_s seed view runs",
     "RunFlags.record": "port duration_s excitation amplitude dry_run",
     "RunFlags.identify": "log terms max_delay_s",
     "RunFlags.train": "ppo",
@@ -31,7 +33,7 @@ _SHOWN: Mapping[str, str] = {
     "PPOConfig": "total_steps",
     "DeployConfig": "port bundle episodes duration_s command dry_run force seed view",
     "NewConfig": "name robot log drive like port",
-    "RobotFlags": "mjcf joints parameter mapping unit rate_hz",
+    "RobotFlags": "mjcf joints mapping unit rate_hz",
     "DoctorConfig": "policy log mjcf contract sim out bundle json",
     "CheckConfig": "log plan bounds fix json runs",
     "ValidateConfig": "parameters log json",

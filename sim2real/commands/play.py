@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from sim2real.commands import flags
 from sim2real.commands.export import find_bundle
 from sim2real.errors import UsageError
-from sim2real.stages.flag import Flag
+from sim2real.stages.flag import WINDOW, Flag
 from sim2real.stages.load import available, load_robot
 
 if TYPE_CHECKING:
@@ -30,33 +30,31 @@ class PlayConfig:
     """A bundle's folder, a run folder, or a pipeline, whose newest training is taken, or its shipped bundle."""
     command: tuple[float, float, float] = (0.6, 0.0, 0.0)
     """Velocity: forwards, to the left [m/s], yaw rate [rad/s]."""
-    seconds: float = 10.0
+    duration_s: float = 10.0
     """Length of the episode [s]."""
     push: float = 0.0
     """Size of a push every 5 s [m/s]."""
     seed: int | None = None
     """Seed of a twin with other friction, load, motors and delays; default: the nominal twin."""
-    window: bool = False
+    view: Annotated[str | None, Flag("[FILE.gif]", alone=WINDOW)] = None
     """Show it in MuJoCo's window; the arrow keys change forward velocity and yaw rate, comma and full stop the sideways
-    one, the space bar stops."""
-    video: Annotated[Path | None, Flag("FILE.gif")] = None
-    """Moving picture to write, from the side; needs no display."""
+    one, the space bar stops. With a name: a moving picture from the side, which needs no display."""
     runs: Path = Path("runs")
     """Folder of all runs."""
 
     def __post_init__(self) -> None:
         """Check the flags."""
-        if not (0.0 < self.seconds <= 3600.0 and 0.0 <= self.push <= 10.0):
-            raise UsageError(f"play takes up to 3600 s and pushes of 0 to 10 m/s, got {self.seconds} and {self.push}")
-        if self.window and self.video:
-            raise UsageError("play shows a window or writes a picture", hint="run it with one of them")
-        if self.video and self.video.suffix != ".gif":
-            raise UsageError(f"--video writes a .gif, got {self.video}", hint="--video walk.gif")
+        if not (0.0 < self.duration_s <= 3600.0 and 0.0 <= self.push <= 10.0):
+            raise UsageError(
+                f"play takes up to 3600 s and pushes of 0 to 10 m/s, got {self.duration_s} and {self.push}"
+            )
+        if self.view not in (None, WINDOW) and not str(self.view).endswith(".gif"):
+            raise UsageError(f"--view alone opens a window, and writes a .gif, got {self.view}", hint="--view walk.gif")
 
 
 def play(command: str, arguments: list[str]) -> None:
     """``sim2real play RUN|PIPELINE|BUNDLE [FLAGS]``."""
-    examples = ("play go2", "play go2 --command 0.5 0 0.4 --video walk.gif", "play go2 --window")
+    examples = ("play go2", "play go2 --command 0.5 0 0.4 --view walk.gif", "play go2 --view")
     run(flags.parse(PlayConfig(), arguments, f"sim2real {command}", *examples))
 
 
@@ -86,16 +84,16 @@ def run(config: PlayConfig) -> "Walked":
     # Walk on its twin.
     hidden = None if config.seed is None else HiddenTwin.draw(np.random.default_rng(config.seed), len(robot.joints))
     twin, wanted = Twin(robot, hidden, config.seed or 0), np.array(config.command)
-    shown: Any = _window(twin, wanted) if config.window else None
-    with progress(None, f"play: {config.seconds:g} s on the twin"):
+    shown: Any = _window(twin, wanted) if config.view == WINDOW else None
+    with progress(None, f"play: {config.duration_s:g} s on the twin"):
         walked = walk(
-            twin, load_bundle(folder), lambda _: wanted.copy(), config.seconds, push_m_s=config.push, shown=shown
+            twin, load_bundle(folder), lambda _: wanted.copy(), config.duration_s, push_m_s=config.push, shown=shown
         )
-    if config.video:
+    if config.view not in (None, WINDOW):
         with progress(None, "play: picture"):
-            _write_picture(twin, walked.qpos, config.video)
-        wrote(config.video)
-    end = f"fell after {walked.fell_s:.1f} s" if walked.fell_s is not None else f"walked for {config.seconds:g} s"
+            _write_picture(twin, walked.qpos, Path(str(config.view)))
+        wrote(str(config.view))
+    end = f"fell after {walked.fell_s:.1f} s" if walked.fell_s is not None else f"walked for {config.duration_s:g} s"
     off = f"off the command by {walked.error_m_s:.3f} m/s and {walked.error_rad_s:.3f} rad/s"
     note(f"{end}; {'too short to measure its error' if np.isnan(walked.error_m_s) else off}")
     return walked

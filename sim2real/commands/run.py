@@ -46,7 +46,7 @@ def demo(command: str, arguments: list[str]) -> None:
 
 def _run(name: str, parsed: RunFlags) -> None:
     """Run the stages, print the main figures of each, and end with the verdict and the page."""
-    compilation_cache.enable(parsed.cache)
+    compilation_cache.enable()
     from sim2real.commands.loop import run_all
     from sim2real.stages.terminal import console
 

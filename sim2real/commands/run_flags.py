@@ -21,8 +21,6 @@ class DemoFlags:
     """Folder of all runs."""
     resume: Annotated[Path | None, Flag("DIR")] = None
     """Run folder to go on with: stages that are finished there, from the newest inputs, are skipped."""
-    cache: Annotated[str | None, Flag("DIR|off")] = None
-    """Folder of compiled programs, or 'off'; default: SIM2REAL_CACHE, otherwise the platform's cache folder."""
     verbose: bool = False
     """Print everything that the stages print; default: a few lines for each stage."""
 

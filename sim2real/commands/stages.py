@@ -34,8 +34,6 @@ class StageFlags(Generic[Config]):
     """Folder of all runs."""
     run: Annotated[Path | None, Flag("DIR")] = None
     """Run folder to add to; default: a new one for record, for the others the newest one with their inputs."""
-    cache: Annotated[str | None, Flag("DIR|off")] = None
-    """Folder of compiled programs, or 'off'; default: SIM2REAL_CACHE, otherwise the platform's cache folder."""
 
 
 def stage(command: str, arguments: list[str]) -> None:
@@ -45,7 +43,7 @@ def stage(command: str, arguments: list[str]) -> None:
     examples = (f"{command} {name} --runs /data/runs", f"report {name}")
     text = (type(default).__doc__ or "").strip().splitlines()[0]
     parsed = flags.parse(StageFlags(default), rest, f"sim2real {command} {name}", *examples, text=text)
-    compilation_cache.enable(parsed.cache)
+    compilation_cache.enable()
     run_dir = None
     if parsed.run:
         from sim2real.stages.shared.find_run import find_run

@@ -29,30 +29,29 @@ _SETTINGS = {
 }
 
 
-def location(place: str | None = None) -> Path | None:
+def location() -> Path | None:
     """Return the folder of this machine's programs; None where the cache is off, or JAX is not installed.
 
-    Args:
-        place: A folder, or ``off``; None takes ``SIM2REAL_CACHE``, otherwise the platform's cache folder.
+    ``SIM2REAL_CACHE`` names a folder, or is ``off``; default: the platform's cache folder.
     """
-    place = place or os.environ.get(VARIABLE) or None
+    place = os.environ.get(VARIABLE)
     if place == OFF or not has_jax():
         return None
     home = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "sim2real"
     root = Path(place).expanduser() if place else home
     if root.exists() and not root.is_dir():
         raise UsageError(
-            f"the compilation cache {root} is no folder", hint=f"--cache DIR or {VARIABLE}=DIR moves it, 'off' ends it"
+            f"the compilation cache {root} is no folder", hint=f"{VARIABLE}=DIR moves it, {VARIABLE}=off ends it"
         )
     return root / "programs" / _machine()
 
 
-def enable(place: str | None = None) -> Path | None:
+def enable() -> Path | None:
     """Let JAX keep compiled programs; return the folder, None where the cache is off or its folder cannot be written.
 
     A cache that the user configured for JAX stays as it is.
     """
-    folder = location(place)
+    folder = location()
     if folder is None or os.environ.get(_JAX):
         return None
     try:

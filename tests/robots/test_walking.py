@@ -72,14 +72,14 @@ def test_targets_act_as_late_as_the_twin_says():
 
 
 def test_play_writes_a_picture(tmp_path, capsys):
-    run(PlayConfig("go2", seconds=0.5, video=tmp_path / "a.gif", runs=tmp_path))
+    run(PlayConfig("go2", duration_s=0.5, view=str(tmp_path / "a.gif"), runs=tmp_path))
     assert (tmp_path / "a.gif").read_bytes()[:3] == b"GIF"
     assert "walked for 0.5 s" in capsys.readouterr().err
 
 
 def test_a_film_of_another_format_is_refused_before_the_walk(tmp_path):
     with pytest.raises(UsageError, match=r"a \.gif"):
-        PlayConfig("go2", video=tmp_path / "a.avi")
+        PlayConfig("go2", view=str(tmp_path / "a.avi"))
 
 
 def test_play_refuses_a_robot_that_does_not_walk(tmp_path):
