@@ -34,15 +34,16 @@
     # Predict the held-out segments: SETTLE_S of each give its initial state, HORIZON_S are compared.
     models = {"identified": estimate.values, "nominal": {p.name: p.nominal for p in model.parameters}}
     columns = predictions.samples(estimate.windows, models, SETTLE_S)  # 8
-    errors = predictions.errors(estimate.windows, columns, list(models), SETTLE_S, [HORIZON_S])
+    positions = predictions.positions(model, robot.units)
+    errors = predictions.errors(columns, list(models), positions, SETTLE_S, HORIZON_S)  # 9
 
     # Judge: the estimate must predict every position better than every baseline, within its bounds.
-    scores = verdict.scores(errors, predictions.positions(model, robot.units))  # 9
     left = None if estimate.converged else estimate.left
-    judgement = verdict.judge(scores, estimate.problem.table, at.x, spread, determined, left=left)  # 10
+    judgement = verdict.judge(errors, estimate.problem.table, at.x, spread, determined, left=left)  # 10
     for line in (judgement.status, *judgement.reasons):
         print(line)
 
 In the order of the data: ``segments``, ``rollouts``, ``residuals``, ``search``, ``fit``, ``uncertainty``,
-``predictions``, ``held_out``, ``terms``, ``expected``, ``verdict``; beside it ``delays``, ``drift``, ``export``.
+``predictions``, ``held_out``, ``terms``, ``expected``, ``lacks``, ``verdict``; beside it ``delays``, ``drift``,
+``export``.
 """

@@ -196,8 +196,9 @@ def _at_other_delays(problem: Problem, found: Refined, report: OnProgress | None
             # The others move as the linear model says; one that nothing determines stays.
             start[others] -= np.linalg.lstsq(J[:, others], J[:, i] * (start[i] - x[i]), rcond=1e-6)[0]
             starts.append(table.within(start))
-        other = refine(problem, np.stack(starts), lively, gain=ROUGH)
-        if not other.loss < (1.0 - ROUGH) * problem.loss(x, lively):
+        # Compare with the descent from here on the same segments: fewer segments always have a lower minimum.
+        other, stays = (refine(problem, np.stack(begins), lively, gain=ROUGH) for begins in (starts, [x]))
+        if not other.loss < (1.0 - ROUGH) * stays.loss:
             break
         better = _refine(problem, other.x[None], report)
         if not better.loss < found.loss:

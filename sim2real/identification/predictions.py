@@ -3,13 +3,12 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sim2real.artifacts.identification import WorstSecond, worst_window
+from sim2real.artifacts.identification import AHEAD, HELD_OUT, ComparedError, WorstSecond, worst_window
 from sim2real.graph.node import TICKS_PER_S
 from sim2real.identification.model import IdentifiableModel, position_of
 from sim2real.identification.residuals import Problem
@@ -17,8 +16,10 @@ from sim2real.log.schema import unit_of
 
 GOAL = "told"
 """Name of the baseline that takes the newest goal for the position."""
-_RUNG, _LEAST_RUNG, _SLOWEST_HZ, _DAMPED = 20, 30, 2.5, 0.05
-"""Most segments in which a resonance is looked for, fewest samples of one; lowest frequency; damping ratio."""
+NO_DELAY = "no delay"
+"""The same model fitted without delays. If it is as good, the data needs no delays; that is no failure."""
+_BETTER = 0.95
+"""Largest ratio of the error to that of a baseline with which a model is better."""
 NOISE = 2.0
 """Errors below this many deviations of the measurement count as noise."""
 
@@ -37,15 +38,6 @@ class Position:
     name: str
     unit: str
     sigma: float
-
-
-@dataclass(frozen=True)
-class Prediction:
-    """Errors of a model on held-out segments up to a horizon: field -> root mean square error; None without data."""
-
-    model: str
-    horizon_s: float
-    rmse: Mapping[str, float | None]
 
 
 def positions(model: IdentifiableModel, units: Mapping[str, str]) -> list[Position]:
@@ -126,32 +118,53 @@ def labels(problem: Problem) -> list[str]:
 
 
 def errors(
-    problem: Problem,
     columns: Mapping[str, np.ndarray],
     models: Sequence[str],
+    positions: Sequence[Position],
     settle_s: float,
-    horizons: Sequence[float],
-) -> list[Prediction]:
-    """Return each model's error over each horizon, on held-out segments.
+    horizon_s: float,
+) -> list[ComparedError]:
+    """Return the errors of each position up to a horizon on held-out segments, beside those of baselines.
 
-    The baseline ``hold`` keeps the last measurement. If commands are positions, the second baseline is the goal itself.
+    The first model is judged; the others are baselines. The baseline ``hold`` keeps the last measurement. If commands
+    are positions, a further baseline is the goal itself. A position without data has no row.
 
     Args:
         columns: Result of ``samples``.
         settle_s: First part of held-out segments, to which initial states were fitted; horizons begin at its end [s].
-        horizons: Horizons [s].
     """
     ahead = columns["into"] - settle_s
-    names = labels(problem)
+    pick = columns["held_out"].astype(bool) & (ahead > 0) & (ahead <= horizon_s)
+    found: dict[Position, dict[str, float]] = {}
+    for p in positions:
+        measured = columns[f"{p.column}_measured"][pick]
+        predicted = {m: _predicted(columns, p.column, m, ahead) for m in (*models, *_baselines(columns))}
+        off = {m: values[pick] - measured for m, values in predicted.items() if values is not None}
+        found[p] = {m: float(np.sqrt(np.mean(o**2))) for m, o in off.items() if o.size}
+    return ranked({p: own for p, own in found.items() if own}, horizon_s)
+
+
+def ranked(found: Mapping[Position, Mapping[str, float]], horizon_s: float) -> list[ComparedError]:
+    """Return errors by model beside each other, the worst position first; the first model is judged.
+
+    First come positions that a baseline beats, then those with the largest error beside the best baseline. Errors below
+    the noise of the measurement count as the noise.
+    """
     rows = []
-    for model in (*models, *_baselines(columns)):
-        predicted = {n: p for n in names if (p := _predicted(columns, n, model, ahead)) is not None}
-        for horizon_s in horizons:
-            pick = columns["held_out"].astype(bool) & (ahead > 0) & (ahead <= horizon_s)
-            off = {n: (p - columns[f"{n}_measured"])[pick] for n, p in predicted.items()}
-            rmse = {n: float(np.sqrt(np.mean(o**2))) if o.size else None for n, o in off.items()}
-            rows.append(Prediction(model, horizon_s, rmse))
-    return rows
+    for p, errors_ in found.items():
+        # A prediction that diverged to NaN is infinitely wrong.
+        finite = {m: e if math.isfinite(e) else math.inf for m, e in errors_.items()}
+        error, noise = finite.pop(next(iter(finite))), NOISE * p.sigma
+        best = min(finite.values(), default=math.inf)
+        excess = max(error, noise) / max(best, noise) if math.isfinite(best) else 0.0
+        # The model without delays is a rough fit: it is shown, and decides nothing.
+        others = {m: e for m, e in finite.items() if m != NO_DELAY}
+        beaten_by = () if error <= noise else tuple(m for m, e in others.items() if error > _BETTER * e)
+        baselines = {m: e if math.isfinite(e) else None for m, e in finite.items()}
+        size = error if math.isfinite(error) else None
+        place = (HELD_OUT, p.column, p.name, p.unit, AHEAD, horizon_s)
+        rows.append((excess, ComparedError(*place, size, beaten_by=beaten_by, baselines=baselines)))
+    return [row for _, row in sorted(rows, key=lambda pair: (not pair[1].beaten_by, -pair[0]))]
 
 
 def _baselines(columns: Mapping[str, np.ndarray]) -> list[str]:
@@ -246,45 +259,3 @@ def _segments(samples: Mapping[str, np.ndarray], settle_s: float) -> Iterator[np
     counts = ~samples["held_out"].astype(bool) | (samples["into"] > settle_s)
     for segment in np.unique(samples["segment"][counts]):
         yield np.flatnonzero(counts & (samples["segment"] == segment))
-
-
-def ringing(samples: Mapping[str, np.ndarray], column: str) -> tuple[float, float]:
-    """Return the largest share of a position's residuals that one resonance explains, and its frequency [Hz].
-
-    A transmission that gives way moves the link beside its drive by y, with y'' + 2 d w y' + w^2 y = -q'' for the
-    predicted motion q. At each frequency y and y' are fitted beside speed, acceleration, dry friction and the free
-    oscillation of each segment. Belts explained 0.37 and more, joints of five real robots 0.27 at most.
-    """
-    from scipy.signal import cont2discrete, lfilter  # 0.2 s
-
-    # Put the fitted segments onto one grid of time.
-    chosen = np.unique(samples["segment"][~samples["held_out"].astype(bool)])
-    rows = [np.flatnonzero(samples["segment"] == s) for s in chosen[:: -(-len(chosen) // _RUNG) or 1]]
-    into = [samples["into"][r].astype(np.float64) for r in rows]
-    if not rows or min(map(len, into)) < _LEAST_RUNG:
-        return 0.0, 0.0
-    step_s, length_s = float(np.median(np.diff(into[0]))), min(float(t[-1] - t[0]) for t in into)
-    grid = np.arange(0.0, length_s, step_s)
-    parts = list(zip(into, rows, strict=True))
-    at = lambda name: np.stack([np.interp(grid, t - t[0], samples[name][r]) for t, r in parts])  # noqa: E731
-    predicted = at(f"{column}_identified")
-    off = at(f"{column}_measured") - predicted
-    if not np.isfinite(predicted).all():
-        return 0.0, 0.0
-    speed = np.gradient(predicted, step_s, axis=1)
-    acceleration, best = np.gradient(speed, step_s, axis=1), (0.0, 0.0)
-    for hz in np.geomspace(_SLOWEST_HZ, max(min(0.35 / step_s, 60.0), _SLOWEST_HZ), 25):
-        w = 2.0 * np.pi * float(hz)
-        discrete: Any = cont2discrete(([1.0], [1.0, 2.0 * _DAMPED * w, w * w]), step_s, "foh")
-        beside = lfilter(discrete[0].ravel(), discrete[1], -acceleration, axis=1)
-        free = np.exp(-_DAMPED * w * grid)
-        own = np.stack([grid**0, grid, free * np.cos(w * grid), free * np.sin(w * grid)], axis=1)
-        basis = np.linalg.qr(own)[0]
-        columns = (speed, acceleration, np.sign(speed), beside, np.gradient(beside, step_s, axis=1))
-        r, *J = (v - v @ basis @ basis.T for v in (off, *columns))
-        J = np.stack([j.ravel() / (np.linalg.norm(j) + 1e-12) for j in J], axis=1)
-        squares = [
-            float(np.sum((r.ravel() - c @ np.linalg.lstsq(c, r.ravel(), rcond=None)[0]) ** 2)) for c in (J[:, :3], J)
-        ]
-        best = max(best, (1.0 - squares[1] / max(squares[0], 1e-300), float(hz)))
-    return best

@@ -1,23 +1,22 @@
 """The verdict on an identification: judged on held-out data, position by position."""
 
 import math
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Sequence
 from typing import Literal
 
 import numpy as np
 
 from sim2real.artifacts.identification import (
     AHEAD,
-    HELD_OUT,
     ComparedError,
     ExpectedError,
     Judgement,
     with_small_unit,
 )
 from sim2real.identification.held_out import HeldOutPart
+from sim2real.identification.lacks import Lack
 from sim2real.identification.parameters import Parameter, ParameterTable
-from sim2real.identification.predictions import NOISE, Position, Prediction
+from sim2real.identification.predictions import NO_DELAY
 from sim2real.identification.uncertainty import ABSENT, BOUND, NOT_REACHED, OK, Determined, Uncertainty
 
 Status = Literal["accepted", "record again", "change the model", "not finished"]
@@ -40,69 +39,12 @@ _ALONE = 0.99
 _APART = 2.0
 """Ratio of the error on that part to that on each other one from which on it decides the expected error."""
 _BASELINES = {"no delay": "the model without delays", "hold": "standing still", "nominal": "the nominal model"}
-NO_DELAY = "no delay"
-"""The same model fitted without delays. If it is as good, the data needs no delays; that is no failure."""
-
-
-def scores(prediction: Sequence[Prediction], positions: Sequence[Position]) -> list[ComparedError]:
-    """Return the errors of each position on held-out data at the longest horizon, the worst first.
-
-    Args:
-        prediction: Result of ``prediction.errors``.
-    """
-    columns = [p.column for p in positions]
-    known = [row for row in prediction if any(row.rmse.get(c) is not None for c in columns)]
-    horizon_s = max((row.horizon_s for row in known), default=None)
-    last = {row.model: row.rmse for row in known if row.horizon_s == horizon_s}
-    if horizon_s is None or "identified" not in last:
-        return []
-    rows = []
-    for p in positions:
-        errors = {model: rmse[p.column] for model, rmse in last.items() if rmse.get(p.column) is not None}
-        if "identified" in errors:
-            rows.append(_scored(p, horizon_s, errors))
-    # The worst first: positions that a baseline beats, then those with the largest error beside the best baseline.
-    return [row for _, row in sorted(rows, key=lambda pair: (not pair[1].beaten_by, -pair[0]))]
-
-
-def _scored(p: Position, horizon_s: float, errors: Mapping[str, float | None]) -> tuple[float, ComparedError]:
-    """Return the error of a position over that of the best baseline, and the row of the position.
-
-    Errors below the noise of the measurement count as the noise.
-    """
-    # A prediction that diverged to NaN is infinitely wrong.
-    finite = {m: e if e is not None and math.isfinite(e) else math.inf for m, e in errors.items()}
-    error, noise = finite.pop("identified"), NOISE * p.sigma
-    best = min(finite.values(), default=math.inf)
-    excess = max(error, noise) / max(best, noise) if math.isfinite(best) else 0.0
-    # The model without delays is a rough fit: it is shown, and decides nothing.
-    others = {m: e for m, e in finite.items() if m != NO_DELAY}
-    beaten_by = () if error <= noise else tuple(m for m, e in others.items() if error > _BETTER * e)
-    size, *others_ = [e if math.isfinite(e) else None for e in (error, *finite.values())]
-    baselines = dict(zip(finite, others_, strict=True))
-    place = (HELD_OUT, p.column, p.name, p.unit, AHEAD, horizon_s)
-    return excess, ComparedError(*place, size, beaten_by=beaten_by, baselines=baselines)
 
 
 def errors_of(row: ComparedError) -> dict[str, float]:
     """Return model -> root mean square error of a position; infinite where the model diverged."""
     errors = {"identified": row.error, **row.baselines}
     return {model: math.inf if error is None else error for model, error in errors.items()}
-
-
-@dataclass(frozen=True)
-class Lack:
-    """What the model lacks.
-
-    Attributes:
-        reasons: Sentences on residuals and free runs.
-        flags: Flags with which to identify again; "": no term mends the model.
-        unexplained: Whether the residuals are so far above the noise that no parameter can be trusted.
-    """
-
-    reasons: tuple[str, ...] = ()
-    flags: str = ""
-    unexplained: bool = False
 
 
 def judge(
@@ -117,7 +59,9 @@ def judge(
     doubts: Sequence[str] = (),
     left: float | None = None,
     exceeded: Sequence[str] = (),
-    lacks: Lack = Lack(),
+    lacks: Lack = Lack(),  # noqa: B008 - frozen
+    too_seldom: str = "",
+    offers_terms: Callable[[], bool] = lambda: False,
 ) -> Judgement:
     """Judge an identification; ``next`` of the result are flags with which to identify again.
 
@@ -130,10 +74,13 @@ def judge(
         left: Length of the next step of a fit that did not converge [standard errors]; None if it converged.
         exceeded: Sentences about errors on held-out data above the expected ones.
         lacks: What the model lacks.
+        too_seldom: A sentence on a log whose commands are logged too seldom for its motion, or "".
+        offers_terms: Whether ``--terms auto`` would compare terms that the model lacks.
     """
     improves, errors = _on_held_out(held_out)
     if left is not None:
-        return Judgement(NOT_FINISHED, (_not_converged(left), *errors, *doubts, *exceeded, *lacks.reasons))
+        why = (_not_converged(left), *errors, *doubts, *exceeded, *lacks.reasons)
+        return Judgement(RECORD, (too_seldom, *why)) if too_seldom else Judgement(NOT_FINISHED, why)
     # Collect the reasons: estimates at bounds, absent parameters, undetermined groups.
     determined = [i for i, n in enumerate(table.names) if not any(n in group for group in check.undetermined)]
     bounded, at_zero, flags = _at_bounds(table, x, spread, determined, max_delay_s, widened)
@@ -159,9 +106,12 @@ def judge(
         (True, ACCEPTED, errors),
     )
     status, deciding = next((status, why) for holds, status, why in rules if holds)
-    return Judgement(
-        status, tuple(dict.fromkeys([*deciding, *reasons, *exceeded, *lacks.reasons])), lacks.flags or flags
-    )
+    flags = lacks.flags or flags
+    if status == CHANGE and too_seldom:  # no model explains a motion between commands that the log lacks
+        status, deciding, flags = RECORD, [too_seldom, *deciding], ""
+    elif status == CHANGE and not (flags or lacks.unexplained) and offers_terms():
+        flags = "--terms auto"
+    return Judgement(status, tuple(dict.fromkeys([*deciding, *reasons, *exceeded, *lacks.reasons])), flags)
 
 
 def state_of(verdict: str, p: Parameter, upper: bool) -> str:

@@ -6,7 +6,7 @@ import pytest
 from sim2real.artifacts.identification import AHEAD, FREE_RUN, HELD_OUT, ComparedError, Identification, Judgement
 from sim2real.identification.expected import wider_for, with_expected_errors
 from sim2real.identification.held_out import HeldOutPart
-from sim2real.identification.verdict import Position
+from sim2real.identification.predictions import Position
 
 JOINT = Position("position[0]", "pan", "rad", 0.001)
 NO_MOTION = np.zeros(40)

@@ -7,7 +7,7 @@ import pytest
 
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.episode import Steps
-from sim2real.identification.predictions import errors, samples
+from sim2real.identification.predictions import errors, positions, samples
 from sim2real.identification.residuals import Problem
 from sim2real.identification.segments import Span
 
@@ -45,8 +45,8 @@ def test_the_nominal_model_without_delays_is_much_worse(fitted):
     }
     columns = samples(fitted.problem, models, SETTLE_S)
     check_measurements(fitted, columns)
-    rows = errors(fitted.problem, columns, list(models), SETTLE_S, [1.0])
-    rmse = {r.model: r.rmse["th"] for r in rows}
+    (row,) = errors(columns, list(models), positions(fitted.problem.model, {}), SETTLE_S, 1.0)
+    rmse = {"identified": row.error, **row.baselines}
     assert rmse["identified"] < 0.03
     assert rmse["nominal"] > 5 * rmse["identified"]
     assert rmse["no_delays"] > 2 * rmse["identified"]

@@ -5,10 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from sim2real.identification.lacks import ringing
 from sim2real.identification.model import Channel
-from sim2real.identification.predictions import errors, labels, ringing
+from sim2real.identification.predictions import Position, errors, labels
 
 SETTLE_S = 0.2
+POSITIONS = (Position("th", "th", "rad", 0.1), Position("q[2]", "q", "rad", 0.1))
 
 
 @pytest.fixture
@@ -42,33 +44,33 @@ def test_columns_are_named_by_field_and_index(problem):
     assert labels(problem) == ["th", "thdot", "q[2]"]
 
 
-def test_errors_count_from_the_end_of_settling_to_the_horizon(problem, columns):
-    rows = {(r.model, r.horizon_s): r for r in errors(problem, columns, ["model"], SETTLE_S, [0.2001, 0.5001])}
-    assert len(rows) == 2 * 2
-    short, long = rows["model", 0.2001], rows["model", 0.5001]
-    assert short.rmse["th"] == pytest.approx(1.0)  # 0.3 and 0.4 s: off by 1
-    assert long.rmse["th"] == pytest.approx(np.sqrt((1 + 1 + 4 + 4 + 4) / 5))  # and 0.5, 0.6 and 0.7 s: off by 2
-    assert long.rmse["thdot"] == pytest.approx(2 * long.rmse["th"])
-    assert long.rmse["q[2]"] == pytest.approx(long.rmse["th"])
+def errors_at(columns, horizon_s):
+    """Return model -> error of each position up to a horizon."""
+    rows = errors(columns, ["model"], POSITIONS, SETTLE_S, horizon_s)
+    return {row.column: {"model": row.error, **row.baselines} for row in rows}
 
 
-def test_holding_still_says_what_was_measured_last(problem, columns):
-    rows = {r.model: r for r in errors(problem, columns, ["model"], SETTLE_S, [0.2001])}
+def test_errors_count_from_the_end_of_settling_to_the_horizon(columns):
+    short, long = (errors_at(columns, horizon_s) for horizon_s in (0.2001, 0.5001))
+    assert short["th"]["model"] == pytest.approx(1.0)  # 0.3 and 0.4 s: off by 1
+    assert long["th"]["model"] == pytest.approx(np.sqrt((1 + 1 + 4 + 4 + 4) / 5))  # and 0.5 to 0.7 s: off by 2
+    assert long["q[2]"]["model"] == pytest.approx(long["th"]["model"])
+
+
+def test_holding_still_says_what_was_measured_last(columns):
     # The last measurement before the horizon is the one at 0.2 s, 2: then 3 and 4 come.
-    assert rows["hold"].rmse["th"] == pytest.approx(np.sqrt((1 + 4) / 2))
+    assert errors_at(columns, 0.2001)["th"]["hold"] == pytest.approx(np.sqrt((1 + 4) / 2))
 
 
-def test_no_samples_no_number(problem, columns):
-    fitted = {n: c[~columns["held_out"]] for n, c in columns.items()}
-    rows = errors(problem, fitted, ["model"], SETTLE_S, [0.3])
-    assert {(r.rmse["th"], r.rmse["q[2]"]) for r in rows} == {(None, None)}
+def test_no_samples_no_number(columns):
+    assert errors_at({n: c[~columns["held_out"]] for n, c in columns.items()}, 0.3) == {}
 
 
-def test_told_is_where_a_joint_was_told_to_be(problem, columns):
+def test_told_is_where_a_joint_was_told_to_be(columns):
     columns = {**columns, "q[2]_told": columns["q[2]_measured"] + np.where(columns["into"] > 0.45, 0.3, 0.1)}
-    rows = {(r.model, r.horizon_s): r for r in errors(problem, columns, ["model"], SETTLE_S, [0.2001, 0.5001])}
-    assert rows["told", 0.2001].rmse["q[2]"] == pytest.approx(0.1)
-    assert set(rows["told", 0.2001].rmse) == {"q[2]"}
+    found = errors_at(columns, 0.2001)
+    assert found["q[2]"]["told"] == pytest.approx(0.1)
+    assert "told" not in found["th"]
 
 
 @pytest.mark.parametrize(("resonance_hz", "found"), [(15.0, True), (8.0, True), (None, False)])

@@ -194,6 +194,9 @@ def test_columns_of_separate_trees_are_moved_together():
     assert states.members(range(4)) == [[0, 2], [1, 3]]
 
 
+POSITIONS = (predictions.Position("y", "y", "", NOISE),)
+
+
 @pytest.mark.parametrize(("tau_s", "least", "most"), [(TAU_S, 0.8, 1.3), (-0.2, 2.0, 20.0)])
 def test_an_unchanged_robot_is_predicted_from_noisy_readings_as_well_as_its_equilibrium_allows(
     problem, tau_s, least, most
@@ -203,7 +206,9 @@ def test_an_unchanged_robot_is_predicted_from_noisy_readings_as_well_as_its_equi
     columns = predictions.samples(problem, {"identified": robot}, SPLIT_S, every)
     (name,) = predictions.labels(problem)
     exact, noisy = (
-        _of_noise(problem, columns, [Noise(name, "", deviation, 0.0, 0.0)], robot, SPLIT_S, LENGTH_S - SPLIT_S)[name]
+        _of_noise(
+            problem, POSITIONS, columns, [Noise(name, "", deviation, 0.0, 0.0)], robot, SPLIT_S, LENGTH_S - SPLIT_S
+        )[name]
         for deviation in (0.0, NOISE)
     )
     assert exact < 0.3 * noisy
@@ -216,4 +221,4 @@ def test_where_the_models_own_motion_diverges_its_error_is_infinite(problem):
     (name,) = predictions.labels(problem)
     columns[f"{name}_identified"] = np.full_like(columns["into"], np.nan)
     noise = [Noise(name, "", NOISE, 0.0, 0.0)]
-    assert _of_noise(problem, columns, noise, TRUE, SPLIT_S, LENGTH_S - SPLIT_S) == {name: np.inf}
+    assert _of_noise(problem, POSITIONS, columns, noise, TRUE, SPLIT_S, LENGTH_S - SPLIT_S) == {name: np.inf}

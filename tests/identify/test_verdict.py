@@ -8,10 +8,10 @@ import pytest
 from sim2real.artifacts.identification import AHEAD, ExpectedError
 from sim2real.identification import verdict
 from sim2real.identification.held_out import HeldOutPart
+from sim2real.identification.lacks import Lack
 from sim2real.identification.parameters import Parameter, ParameterTable
-from sim2real.identification.predictions import Position, Prediction
+from sim2real.identification.predictions import Position, ranked
 from sim2real.identification.uncertainty import Determined
-from sim2real.identification.verdict import scores
 
 DELAYS = ("sensor_delay", "actuator_delay")
 TABLE = ParameterTable(
@@ -27,14 +27,13 @@ ONE = (Position("th", "th", "rad", 1e-6),)
 TWO = (Position("position[0]", "pan", "rad", 0.002), Position("position[1]", "tilt", "rad", 0.002))
 
 
-def rows(identified, nominal, horizon_s=1.0, column="th", **others):
-    errors = {"identified": identified, "nominal": nominal, **others}
-    return [Prediction(m, horizon_s, {column: e}) for m, e in errors.items()]
+def rows(identified, nominal, **others):
+    return ranked({ONE[0]: {"identified": identified, "nominal": nominal, **others}}, 1.0)
 
 
 def both(first, second):
     """Return rows of two positions; model -> error of each."""
-    return [Prediction(m, 1.0, {"position[0]": first[m], "position[1]": e}) for m, e in second.items()]
+    return ranked(dict(zip(TWO, (first, second), strict=True)), 1.0)
 
 
 def spread(misfit=1.0, **verdicts):
@@ -46,9 +45,9 @@ def check(*groups):
     return Determined(groups, tuple(f"nothing in this data determines {', '.join(g)}" for g in groups), {})
 
 
-def judge(prediction, spread=spread(), check=check(), positions=ONE, x=None, **more):  # noqa: B008 - neither changes
+def judge(errors, spread=spread(), check=check(), x=None, **more):  # noqa: B008 - neither changes
     x = (TABLE.low + TABLE.high) / 2 if x is None else x
-    return verdict.judge(scores(prediction, positions), TABLE, x, spread, check, **{"max_delay_s": 0.06, **more})
+    return verdict.judge(errors, TABLE, x, spread, check, **{"max_delay_s": 0.06, **more})
 
 
 def test_accepted():
@@ -70,43 +69,31 @@ def test_a_baseline_that_diverges_is_no_better(diverged):
     assert judge(rows(0.1, diverged)).status == "accepted"
 
 
-def test_the_longest_horizon_on_held_out_data_decides():
-    prediction = rows(2.0, 1.0, horizon_s=0.1) + rows(0.5, 1.0, horizon_s=1.0)
-    assert judge(prediction).status == "accepted"
-    nothing = [Prediction("identified", 3.0, {"th": None})]
-    assert judge(prediction + nothing).status == "accepted"
-
-
 GOOD = {"identified": 0.01, "no delay": 0.05, "nominal": 0.2, "hold": 0.4, "told": 0.1}
 
 
 @pytest.mark.parametrize("worse", [{"identified": 50.0}, {"told": 0.009}, {"hold": 0.01}])
 def test_every_position_has_to_improve_on_every_baseline(worse):
-    assert judge(both(GOOD, GOOD), positions=TWO).status == "accepted"
-    for culprit, prediction in (("tilt", both(GOOD, GOOD | worse)), ("pan", both(GOOD | worse, GOOD))):
-        found = judge(prediction, positions=TWO)
+    assert judge(both(GOOD, GOOD)).status == "accepted"
+    for culprit, errors in (("tilt", both(GOOD, GOOD | worse)), ("pan", both(GOOD | worse, GOOD))):
+        found = judge(errors)
         assert found.status == "change the model"
         assert [r.split("data ")[1].split(" ")[0] for r in found.reasons if "no better than" in r] == [culprit]
 
 
 def test_the_worst_position_comes_first_and_all_are_told():
-    found = judge(both(GOOD, GOOD | {"identified": 0.04}), positions=TWO)
+    found = judge(both(GOOD, GOOD | {"identified": 0.04}))
     assert [r.split("data ")[1].split(" ")[0] for r in found.reasons] == ["tilt", "pan"]
     assert "the model without delays by 0.05 rad" in found.reasons[0]
-    lost = judge(both(GOOD | {"identified": 50.0}, GOOD), positions=TWO)
+    lost = judge(both(GOOD | {"identified": 50.0}, GOOD))
     assert "pan is no better than: nominal (0.2 rad), hold (0.4 rad), told (0.1 rad)" in str(lost)
-
-
-def test_where_commands_are_no_positions_nothing_was_told():
-    prediction = [*rows(0.1, 1.0), Prediction("told", 1.0, {"other": 0.01})]
-    assert judge(prediction).status == "accepted"
 
 
 def test_a_joint_that_stood_still_cannot_be_predicted_better_than_its_noise():
     still = dict.fromkeys(GOOD, 0.0015) | {"identified": 0.0024}
-    assert judge(both(GOOD, still), positions=TWO).status == "accepted"
+    assert judge(both(GOOD, still)).status == "accepted"
     drifts = still | {"identified": 0.02}
-    assert judge(both(GOOD, drifts), positions=TWO).status == "change the model"
+    assert judge(both(GOOD, drifts)).status == "change the model"
 
 
 def test_a_rough_fit_without_delays_decides_nothing():
@@ -156,7 +143,7 @@ def test_a_bound_of_0_that_a_user_set_above_the_models_is_a_bound():
     table = TABLE.with_bounds({"offset": (0.0, 1.0)})
     x = (table.low + table.high) / 2
     x[table.names.index("offset")] = 0.0
-    found = verdict.judge(scores(rows(0.1, 1.0), ONE), table, x, spread(offset="at a bound"), check(), max_delay_s=0.06)
+    found = verdict.judge(rows(0.1, 1.0), table, x, spread(offset="at a bound"), check(), max_delay_s=0.06)
     assert (found.status, found.next) == ("change the model", "--bounds offset -1 1")
 
 
@@ -166,7 +153,7 @@ def test_a_delay_whose_bounds_were_narrowed_gets_wider_ones():
     x[own] = narrow.high[own]
     verdicts = ["ok"] * own + ["at a bound"]
     made = SimpleNamespace(verdict=tuple(verdicts), misfit=1.0)
-    found = verdict.judge(scores(rows(0.1, 1.0), ONE), narrow, x, made, check(), max_delay_s=0.06)
+    found = verdict.judge(rows(0.1, 1.0), narrow, x, made, check(), max_delay_s=0.06)
     assert found.next == "--bounds sensor_delay 0 0.02"
 
 
@@ -201,7 +188,7 @@ def test_extrapolation_is_said():
 
 
 def test_a_term_that_halves_the_error_comes_before_a_parameter_that_nothing_determines():
-    lacks = verdict.Lack(("direction lowers the error by 62%",), "--terms direction")
+    lacks = Lack(("direction lowers the error by 62%",), "--terms direction")
     found = judge(rows(0.1, 1.0), check=check(("gain",)), lacks=lacks)
     assert (found.status, found.next) == ("change the model", "--terms direction")
     assert found.reasons[0] == "direction lowers the error by 62%"
@@ -219,3 +206,15 @@ def test_a_part_that_alone_determines_a_parameter_is_named_where_it_decides_the_
     assert ("damping" in sentence) == bool(sentence)
     assert "gain" not in sentence
     assert verdict.advised(["another", sentence]).endswith(" b") == bool(sentence)
+
+
+@pytest.mark.parametrize(("own", "status"), [(0.1, "accepted"), (2.0, "record again")])
+def test_commands_that_are_logged_too_seldom_are_recorded_again_where_no_model_fits(own, status):
+    found = judge(rows(own, 1.0), too_seldom="log: commands at 10 Hz")
+    assert (found.status, found.next) == (status, "")
+    assert (found.reasons[0] == "log: commands at 10 Hz") == (status == "record again")
+
+
+def test_where_nothing_else_helps_further_terms_are_tried():
+    assert judge(rows(2.0, 1.0), offers_terms=lambda: True).next == "--terms auto"
+    assert judge(rows(2.0, 1.0), lacks=Lack(unexplained=True), offers_terms=lambda: True).next == ""

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from sim2real.artifacts.identification import with_small_unit, worst_window
-from sim2real.identification.predictions import worst_second
-from sim2real.identification.verdict import Position
+from sim2real.identification.predictions import Position, worst_second
 
 LARGE, SMALL = Position("q[0]", "hip", "rad", 0.001), Position("q[1]", "wrist", "rad", 0.001)
 

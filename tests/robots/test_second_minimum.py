@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sim2real.identification.config import FitConfig
-from sim2real.identification.fit import ROUGH, _at_other_delays, refine
+from sim2real.identification.fit import ROUGH, Refined, _at_other_delays, refine
 from sim2real.identification.residuals import Problem
 from sim2real.identification.segments import Span
 from sim2real.stages.config import RecordConfig
@@ -29,9 +29,11 @@ def test_a_fit_that_ends_in_the_second_minimum_goes_on_to_the_first():
     table = model.parameters.with_fixed({"sensor_delay": 0.0, "payload": 0.0})
     spans = [Span(0, begin_s) for begin_s in (0.0, 2.6, 5.2, 7.8)]
     problem = Problem(model, [episode], spans, 1.3, config, table)
-    begin = table.encode(values | {"actuator_delay": 0.028, "armature": 0.0045})
-    second = refine(problem, begin[None], gain=ROUGH)
-    assert table.decode(second.x)["actuator_delay"] > TRUTH["actuator_delay"] + 4e-3
+    # The best estimates beside such a delay.
+    held = Problem(model, [episode], spans, 1.3, config, table.with_fixed({"actuator_delay": 0.028}))
+    end = refine(held, held.table.encode(values | {"armature": 0.0045})[None], gain=ROUGH)
+    x = table.encode(held.table.decode(end.x))
+    second = Refined(x, problem.loss(x), np.nan, False)
     found = table.decode(_at_other_delays(problem, second, None).x)
     assert found["actuator_delay"] == pytest.approx(TRUTH["actuator_delay"], abs=1.5e-3)
     assert found["armature"] == pytest.approx(TRUTH["armature"], rel=0.1)

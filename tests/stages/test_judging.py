@@ -196,14 +196,15 @@ def test_the_verdict_is_in_the_artifact(tmp_path):
     assert (found.advice, found.drift, found.replay) == (told.advice, told.drift, told.replay)
 
 
-@pytest.mark.parametrize(("errors", "limit"), [([0.1] * 16, 0.1), ([0.1] * 14 + [math.nan, None], math.inf)])
+@pytest.mark.parametrize(("errors", "limit"), [([0.1] * 16, 0.1), ([0.1] * 14 + [math.nan, math.inf], math.inf)])
 def test_a_prediction_that_diverges_is_infinitely_wrong(monkeypatch, errors, limit):
     left = iter(errors)
     monkeypatch.setattr(replay.prediction, "samples", lambda *_: {})
-    row = lambda *_: [replay.prediction.Prediction("identified", 1.0, {"th": next(left)})]  # noqa: E731
+    th = replay.Position("th", "th", "rad", 1e-6)
+    row = lambda *_: replay.prediction.ranked({th: {"identified": next(left)}}, 1.0)  # noqa: E731
     monkeypatch.setattr(replay.prediction, "errors", row)
     problem = SimpleNamespace(ts=np.zeros((1, 3)), segments=1, readings={"th": np.zeros((1, 3))})
     problem.with_readings = lambda readings: problem
     noise = (Noise("th", "rad", 0.01, 0.0, 0.0),)
-    found = replay._of_noise(problem, {"th_identified": np.zeros(3)}, noise, {}, 0.3, 1.0)
+    found = replay._of_noise(problem, [th], {"th_identified": np.zeros(3)}, noise, {}, 0.3, 1.0)
     assert found == {"th": pytest.approx(limit)}

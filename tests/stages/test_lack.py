@@ -1,7 +1,6 @@
 """What a model lacks: residuals far above the noise and free runs that are far off, and the term that mends them."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,9 +15,10 @@ from sim2real.artifacts.identification import (
     TriedTerm,
     WorstSecond,
 )
-from sim2real.identification.verdict import Position
+from sim2real.identification import lacks
+from sim2real.identification.lacks import farthest_run, find_lack, largest_residual, unexplained_second
+from sim2real.identification.predictions import Position
 from sim2real.stages.identify import judgement
-from sim2real.stages.identify.judgement import farthest_run, lack, largest_residual
 
 AXIS, ARM = Position("x[0]", "axis", "m", 1e-5), Position("x[1]", "arm", "rad", 1e-3)
 NOISE = (Noise("x[1]", "rad", 1e-3, 0.0, 0.0),)
@@ -40,12 +40,8 @@ def document(times_noise, *runs, tried=(), terms=()):
 
 def lacked(found, monkeypatch, leaning=None, rings=(0.1, 4.0)):
     """Return what a document lacks."""
-    monkeypatch.setattr(judgement, "positions", lambda *_: [AXIS, ARM])
-    monkeypatch.setattr(judgement, "noises", lambda *_: NOISE)
-    monkeypatch.setattr(judgement, "inclined", lambda *_: leaning)
-    monkeypatch.setattr(judgement, "ringing", lambda *_: rings)
-    inputs = SimpleNamespace(model=None, units={}, robot=SimpleNamespace(units={}))
-    return lack(found, SimpleNamespace(inputs=inputs, estimate=SimpleNamespace(converged=True)))
+    monkeypatch.setattr(lacks, "ringing", lambda *_: rings)
+    return find_lack(found, [AXIS, ARM], NOISE, lambda: leaning)
 
 
 @pytest.mark.parametrize(
@@ -69,10 +65,11 @@ def test_a_model_lacks_the_term_that_halves_its_errors(times_noise, tried, named
 
 @pytest.mark.parametrize(("times_noise", "named"), [(9.0, False), (25.0, True)])
 def test_gravity_of_another_direction_is_named_first_with_its_command(times_noise, named, monkeypatch):
-    leaning = 0.99, {"tilt_x": 0.0, "tilt_y": 0.7}, "--terms tilt"
+    leaning = 0.99, {"tilt_x": 0.0, "tilt_y": 0.7}
     found = lacked(document(times_noise, terms=("drag",)), monkeypatch, leaning)
     assert ("+0.70 rad (tilt_y)" in found.reasons[0]) == named
-    assert found.flags == ("--terms tilt" if named else "")
+    assert found.flags.startswith("--terms drag,tilt --bounds tilt_x -3.15" if named else "")
+    assert bool(found.flags) == named
 
 
 @pytest.mark.parametrize(("times_noise", "share", "named"), [(2.0, 0.5, False), (8.0, 0.5, True), (8.0, 0.3, False)])
@@ -115,7 +112,7 @@ def test_positions_are_compared_by_their_own_noise_and_range():
 ])  # fmt: skip
 def test_a_second_that_is_worse_than_all_others_is_named_before_what_it_bends(error, of_motion, said, alone):
     worst = WorstSecond("arm", "x[1]", "rad", 0, 0, 4.1, 5.1, error, of_motion)
-    sentence, first = judgement._fault(worst, document(20.0))
+    sentence, first = unexplained_second(replace(document(20.0), worst=worst))
     assert ("arm in the second from 4.1 s" in sentence, first) == (said, alone)
 
 

@@ -16,7 +16,7 @@ from sim2real.identification.fit import refine
 from sim2real.identification.held_out import MOVES
 from sim2real.identification.model import ChecksLogs, IdentifiableModel
 from sim2real.identification.parameters import ParameterTable
-from sim2real.identification.predictions import NOISE, positions
+from sim2real.identification.predictions import NOISE, Position, positions
 from sim2real.identification.residuals import Problem
 from sim2real.identification.segments import Span
 from sim2real.robots.robot import RecordedRobot
@@ -58,15 +58,16 @@ def tested(
     }
     all_segments = np.ones(problem.segments, bool)
     columns = prediction.samples(problem, models, config.settle_s, all_segments)
-    errors = prediction.errors(problem, columns, list(models), config.settle_s, [ahead_s])
+    measured = positions(problem.model, robot.units)
+    errors = prediction.errors(columns, list(models), measured, config.settle_s, ahead_s)
     # Predict the model's own motion from readings with noise: the errors of a robot that has not changed.
-    alike = _of_noise(problem, columns, identification.noise, models["identified"], config.settle_s, ahead_s)
+    noise = identification.noise
+    alike = _of_noise(problem, measured, columns, noise, models["identified"], config.settle_s, ahead_s)
     # Compare the errors with those on the identification's held-out data.
     held_out, held = (_held_out(identification, model, ahead_s) for model in ("identified", "hold"))
     rows = []
-    for position in positions(problem.model, robot.units):
-        rmse = {e.model: e.rmse.get(position.column) for e in errors}
-        rmse = {m: e if e is not None and math.isfinite(e) else None for m, e in rmse.items()}
+    for position in measured:
+        rmse = next(({"identified": e.error, **e.baselines} for e in errors if e.column == position.column), {})
         expected, moved, now = held_out.get(position.column), held.get(position.column), rmse.get("hold")
         if expected is not None:  # a model's error grows with the motion
             expected = expected_at(identification, position.column, expected)
@@ -150,6 +151,7 @@ def _moves(model: IdentifiableModel, episode: Episode, begin_s: float, length_s:
 
 def _of_noise(
     problem: Problem,
+    measured: Sequence[Position],
     columns: Mapping[str, np.ndarray],
     noise: Sequence[Noise],
     values: Mapping[str, float],
@@ -169,19 +171,18 @@ def _of_noise(
     fields = {n.column: n for n in noise if f"{n.column}_identified" in columns}
     rows: dict[str, list[float]] = {column: [] for column in fields}
     for _ in range(_REPETITIONS):
-        measured = {f: np.array(values) for f, values in problem.readings.items()}
+        readings = {f: np.array(values) for f, values in problem.readings.items()}
         for column, n in fields.items():
             name, index = n.place
             reading = columns[f"{column}_identified"] + n.deviation * rng.normal(size=len(at[0]))
             reading = n.quantum * np.round(reading / n.quantum) if n.quantum else reading
-            measured[name][at if index is None else (*at, index)] = reading
-        noisy = problem.with_readings(measured)
+            readings[name][at if index is None else (*at, index)] = reading
+        noisy = problem.with_readings(readings)
         predicted = prediction.samples(noisy, {"identified": values}, settle_s, every)
-        errors = prediction.errors(noisy, predicted, ["identified"], settle_s, [ahead_s])
-        rmse = next(e.rmse for e in errors if e.model == "identified")
+        errors = prediction.errors(predicted, ["identified"], measured, settle_s, ahead_s)
+        sizes = {e.column: e.error for e in errors if e.error is not None}
         for column in fields:
-            error = rmse.get(column)
-            rows[column].append(error if error is not None and math.isfinite(error) else math.inf)
+            rows[column].append(sizes.get(column, math.inf))
     return {column: float(np.quantile(errors, 0.95, method="higher")) for column, errors in rows.items()}
 
 

@@ -6,20 +6,15 @@ import math
 import time
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import Any
 
 import numpy as np
 
 from sim2real.artifacts.identification import (
-    FREE_RUN,
     ROUND_TRIP,
     Estimate,
     Identification,
     Judgement,
-    Noise,
-    WorstSecond,
-    with_small_unit,
 )
 from sim2real.artifacts.posterior import Posterior
 from sim2real.graph.episode import Episode
@@ -27,12 +22,12 @@ from sim2real.identification import predictions as prediction
 from sim2real.identification import verdict
 from sim2real.identification.delays import links
 from sim2real.identification.expected import wider_for, with_expected_errors
-from sim2real.identification.fit import ROUGH, Fit, as_numbers, refine, refit
+from sim2real.identification.fit import Fit, as_numbers, refit
 from sim2real.identification.held_out import HeldOutPart
-from sim2real.identification.predictions import Position, positions, replays, ringing, worst_second
+from sim2real.identification.lacks import TILT, Lack, find_lack, turned_gravity
+from sim2real.identification.predictions import NO_DELAY, positions, replays
 from sim2real.identification.residuals import Linearised, Problem, few_of
 from sim2real.identification.segments import Span, extents
-from sim2real.identification.terms import MENDS
 from sim2real.identification.uncertainty import (
     ABSENT,
     NOT_REACHED,
@@ -44,7 +39,7 @@ from sim2real.identification.uncertainty import (
 )
 from sim2real.identification.uncertainty import determined as what_is_determined
 from sim2real.identification.uncertainty import widening as posterior_widening
-from sim2real.identification.verdict import ACCEPTED, CHANGE, NO_DELAY, NOT_FINISHED, RECORD, Lack, scores, state_of
+from sim2real.identification.verdict import ACCEPTED, state_of
 from sim2real.log.importing.checks import slow_sides
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.identify.fitting import Fits, determined, has_parts, widened, without_parts
@@ -61,31 +56,6 @@ _HORIZONS = (0.1, 1.0)
 """Shares of the horizon up to which errors are stored; a deployment is compared at the shorter one."""
 _MOST = 3
 """Most errors above the expected ones that are named."""
-_FAR = 3.0
-"""Ratio of residuals to noise above which a term is missing."""
-_FLOOR = 0.1
-"""Smallest noise, in assumed deviations of a measurement: simulated logs have none, and residuals of integrators."""
-_ALONE = 1.5
-"""Ratio of the error in the worst second to a joint's whole error from which on a fault is in that second."""
-_PROMISING = 0.95
-"""Ratio of the residuals with turned gravity to those without, by linear algebra, above which no turn is tried."""
-_GRAVITY = 10.0
-"""Ratio of residuals to noise above which other directions of gravity are tried."""
-_TILT, _TURNS = "tilt", (-1.6, -0.8, -0.3, 0.3, 0.8, 1.6, 3.1)
-"""The term of an inclined base, and the turns about each of its axes that are simulated [rad]."""
-_UNEXPLAINED = 50.0
-"""Ratio of residuals to noise above which a fit is not accepted: real motors leave 5 to 32 times their noise. A base at
-40 degrees left 120 times, and a belt that gives way 57 times, with wrong estimates in narrow intervals."""
-_RINGS = 1 / 3
-"""Share of the residuals that a resonance explains, above which a transmission gives way."""
-_GIVES_WAY = (
-    "a belt, a gear or a mount gives way; the delay includes its lag, so these are no estimates. Measure at the motor, "
-    "or make it stiffer"
-)
-_CAUSES = (
-    "look for a gear or a unit of the command, the direction of gravity, a transmission that gives way, an encoder's "
-    "zero, or commands that are logged more seldom than they act"
-)
 
 
 def judge(fits: Fits, started_s: float) -> Identification:
@@ -118,7 +88,7 @@ def judge(fits: Fits, started_s: float) -> Identification:
         document = replace(document, terms=fits.terms, tried=fits.tried, links=links_, aggregate=aggregate)
         document = _compared(document, inputs, fit, parts)
         bar.set_description_str("identify: what the model lacks")
-        lacks = patiently(lambda: lack(document, fits))
+        lacks = patiently(lambda: _lack(document, inputs, fit))
     if inputs.standing is not None:
         document = with_load(document, inputs.robot, inputs.standing, truth)
     names = [n for n in inputs.undetermined if n not in document.values]
@@ -252,9 +222,8 @@ def _predicted(document: Identification, inputs: Inputs, fit: Fit) -> Identifica
     models: dict[str, Mapping[str, float]] = {"identified": fit.values, **_without_delays(fit), "nominal": nominal}
     samples = prediction.samples(problem, models, config.settle_s)
     horizons = [round(share * config.horizon_s, 3) for share in _HORIZONS]
-    found = prediction.errors(problem, samples, list(models), config.settle_s, horizons)
     measured = positions(inputs.model, inputs.units)
-    errors = [row for s in horizons for row in scores([f for f in found if f.horizon_s == s], measured)]
+    errors = [row for s in horizons for row in prediction.errors(samples, list(models), measured, config.settle_s, s)]
     drawn = {name: values for name, values in models.items() if name != "nominal"}
     columns, long = free_runs(fit, inputs.episodes, inputs.fitted, config, drawn)
     return replace(
@@ -264,6 +233,7 @@ def _predicted(document: Identification, inputs: Inputs, fit: Fit) -> Identifica
         replays={**replays(problem, fit.values, config.settle_s, "ahead"), **long},
         settle_s=config.settle_s,
         errors=tuple(errors),
+        worst=prediction.worst_second(samples, measured, config.settle_s),
     )
 
 
@@ -318,132 +288,30 @@ def _compared(document: Identification, inputs: Inputs, fit: Fit, parts: Sequenc
     return with_expected_errors(document, measured, parts, names, inputs.fitted, wider)
 
 
-def lack(document: Identification, fits: Fits) -> Lack:
-    """Return what a model lacks: by residuals far above the noise, another direction of gravity, and free runs.
+def _lack(document: Identification, inputs: Inputs, fit: Fit) -> Lack:
+    """Return what a model lacks; another direction of gravity is tried if the robot can have one."""
 
-    Args:
-        document: With samples, errors on held-out data and the tried terms.
-    """
-    inputs, fit = fits.inputs, fits.estimate
-    measured, chosen = positions(inputs.model, inputs.robot.units), [*(document.terms or ())]
-    reasons, flags, unexplained = list[str](), "", False
-    worst = largest_residual(document, noises(document.samples, inputs.units), measured)
-    if worst is not None and worst[1] > _FAR:
-        position, ratio, level = worst
-        unit = f" {position.unit}".rstrip()
-        sentence = f"residuals of {position.name} are {ratio:.2g} times its noise of {level:.2g}{unit}"
-        best = next((t for t in document.tried if t.outcome == "mends" and t.term not in chosen), None)
-        if not document.tried:
-            reasons.append(f"{sentence}: the model lacks something; no optional term was tried")
-        elif best is None:
-            reasons.append(f"{sentence}; no further term lowers the error on held-out parts by a tenth")
-        else:
-            gain, with_it = best.gain or 0.0, f"--terms {','.join([*chosen, best.term])}"
-            flags = with_it if gain > 1.0 - MENDS else ""
-            reasons.append(f"{sentence}; {best.term} lowers the error on held-out parts by {gain:.0%}: {with_it}")
-        # A base that is mounted at an angle bends all other parameters.
-        if ratio > _GRAVITY and not flags and fit.converged and (leaning := inclined(inputs, fit)) is not None:
-            share, turns, flags = leaning
-            how = " and ".join(f"{angle:+.2f} rad ({name})" for name, angle in turns.items())
-            reasons.insert(
-                0,
-                f"with gravity turned by {how} the squared residuals are {share:.0%} smaller: is the base at an angle? "
-                f"turn the gravity of the model, or identify the angle: {flags}",
-            )
-        share, hz = ringing(document.samples, position.column)
-        if share > _RINGS:
-            reasons.insert(0, f"{position.name} rings at {hz:.2g} Hz, beyond what the model explains: {_GIVES_WAY}")
-        elif ratio > _UNEXPLAINED:
-            reasons[-1] += f"; parameters that explain so little are no estimates: {_CAUSES}"
-        unexplained = share > _RINGS or ratio > _UNEXPLAINED
-    if (run := farthest_run(document, measured)) is not None:
-        position, error, share = run
-        size = "diverges"
-        if math.isfinite(error):
-            size = f"is off by {with_small_unit(error, position.unit)}, {share:.1%} of its range"
-        seconds = max(r.seconds for r in document.errors if (r.kind, r.column) == (FREE_RUN, position.column))
-        reasons.append(f"in free runs of {seconds:.3g} s on held-out data {position.name} {size}")
-    return Lack(tuple(reasons), flags, unexplained)
+    def inclined() -> tuple[float, dict[str, float]] | None:
+        problem = tilted(inputs, fit) if fit.converged else None
+        return None if problem is None else turned_gravity(problem, fit.values)
+
+    measured = positions(inputs.model, inputs.robot.units)
+    return find_lack(document, measured, noises(document.samples, inputs.units), inclined)
 
 
-def inclined(inputs: Inputs, fit: Fit) -> tuple[float, dict[str, float], str] | None:
-    """Return by which share another direction of gravity lowers the loss, its turns by name [rad], and flags.
-
-    None if the robot has no such term, or no direction halves the error. Directions all around are simulated with the
-    estimates and with the nominal values, as estimates for a wrong direction are bent; what is better is refined.
-    """
+def tilted(inputs: Inputs, fit: Fit) -> Problem | None:
+    """Return a fit's segments with the term of an inclined base; None if the robot has no such term to identify."""
     config, chosen = inputs.config, fit.problem.table.terms
-    wanted = ",".join([*chosen, _TILT])
+    wanted = ",".join([*chosen, TILT])
     offered = configured(inputs.loaded, replace(config, terms=wanted)).identifiable(config.max_delay_s)
-    turns = [p.name for p in offered.parameters if p.term == _TILT]
-    if not turns or _TILT in chosen or set(turns) & set(config.fix):
+    turns = [p.name for p in offered.parameters if p.term == TILT]
+    if not turns or TILT in chosen or set(turns) & set(config.fix):
         return None
-    tilted = with_terms(inputs, wanted, bounds=dict.fromkeys(turns, (-math.pi, math.pi)))
-    if not set(fit.values) <= {p.name for p in tilted.table}:
+    more = with_terms(inputs, wanted, bounds=dict.fromkeys(turns, (-math.pi, math.pi)))
+    if not set(fit.values) <= {p.name for p in more.table}:
         return None
     length_s = config.settle_s + config.horizon_s
-    problem = few_of(Problem(tilted.model, inputs.episodes, inputs.windows, length_s, config, tilted.table))
-    estimate = problem.table.encode({p.name: p.without for p in problem.table} | fit.values)
-    columns = np.array([c.name in turns for c in problem.table.columns])
-    # Nothing is searched for unless a small turn would help, by linear algebra.
-    if not _promises(problem.linearise(estimate), columns):
-        return None
-    starts = []
-    for x in (estimate, problem.table.start()):
-        candidates = np.repeat(x[None], 1 + len(_TURNS) * int(columns.sum()), axis=0)
-        for k, (column, angle) in enumerate(product(np.flatnonzero(columns), _TURNS), 1):
-            candidates[k, column] = angle
-        losses = np.nan_to_num(problem.losses(candidates, x), nan=np.inf)
-        if np.argmin(losses):
-            starts.append(candidates[int(np.argmin(losses))])
-    if not starts:
-        return None
-    before = refine(problem, estimate[None], problem.part(present=~columns), gain=ROUGH)
-    after = refine(problem, np.stack(starts), gain=ROUGH)
-    if not after.loss < MENDS**2 * before.loss:
-        return None
-    values = as_numbers(problem.table, after.x)
-    flags = [f"--terms {wanted}", *(f"--bounds {name} -3.15 3.15" for name in turns)]
-    return 1.0 - after.loss / before.loss, {n: float(np.ravel(values[n])[0]) for n in turns}, " ".join(flags)
-
-
-def _promises(at: Linearised, columns: np.ndarray) -> bool:
-    """Return whether a linear step of some parameters beside all others lowers the residuals by 5 % more."""
-    J, r = at.jacobian.reshape(-1, len(at.x)), at.residuals.reshape(-1)
-    left = [np.linalg.norm(r - J[:, which] @ np.linalg.lstsq(J[:, which], r, rcond=None)[0]) for which in (
-        ~columns, np.ones_like(columns))]  # fmt: skip
-    return bool(left[1] < _PROMISING * left[0])
-
-
-def largest_residual(
-    document: Identification, noises: Sequence[Noise], positions: Sequence[Position]
-) -> tuple[Position, float, float] | None:
-    """Return the position whose residuals are largest beside its noise, the ratio, and the noise; None if unknown."""
-    rows = []
-    for p in positions:
-        of = next((n for n in noises if n.column == p.column), None)
-        if of is None:
-            continue
-        off = document.samples[f"{p.column}_measured"] - document.samples[f"{p.column}_identified"]
-        off = off[np.isfinite(off) & (document.samples["into"] > document.settle_s)]
-        level = max(float(np.hypot(of.deviation, of.quantum / np.sqrt(12.0))), _FLOOR * p.sigma)
-        if off.size:
-            rows.append((p, float(np.sqrt(np.mean(off**2))) / level, level))
-    return max(rows, key=lambda row: row[1], default=None)
-
-
-def farthest_run(document: Identification, positions: Sequence[Position]) -> tuple[Position, float, float] | None:
-    """Return the position whose free runs have the largest error as a share of its range, the error, and the share."""
-    errors = [(p, error) for p in positions if (error := mean_error(document, p)) is not None]
-    sizes = [max(float(np.ptp(document.samples[f"{p.column}_measured"])), 1e-300) for p, _ in errors]
-    rows = [(p, error, error / size) for (p, error), size in zip(errors, sizes, strict=True)]
-    return max(rows, key=lambda row: row[2], default=None)
-
-
-def mean_error(document: Identification, position: Position) -> float | None:
-    """Return the mean error of a position in free runs on held-out data; None without one."""
-    errors = [row.error for row in document.errors if (row.kind, row.column) == (FREE_RUN, position.column)]
-    return float(np.mean([math.inf if e is None else e for e in errors])) if errors else None
+    return few_of(Problem(more.model, inputs.episodes, inputs.windows, length_s, config, more.table))
 
 
 def _judged(
@@ -460,15 +328,9 @@ def _judged(
         doubts: Sentences about parameters that are held, and terms.
         set_by_user: Parameters whose bounds the user has set.
     """
-    fit, measured = findings.fit, positions(findings.fit.problem.model, inputs.units)
+    fit = findings.fit
     above = [str(row) for row in document.judged if row.exceeded]
-    # A fault in fitted data changes no held-out error, so it does not change the status; it may be why nothing else is
-    # explained.
-    worst = worst_second(document.samples, measured, document.settle_s)
-    fault, alone = _fault(worst, document)
-    if alone and lacks.unexplained:
-        lacks = replace(lacks, reasons=(fault, *lacks.reasons))
-    judged = verdict.judge(
+    judgement = verdict.judge(
         document.held_out,
         fit.problem.table,
         findings.x,
@@ -480,27 +342,12 @@ def _judged(
         left=None if fit.converged else fit.left,
         exceeded=above[:_MOST] + [f"{len(above) - _MOST} more errors are above"] * (len(above) > _MOST),
         lacks=lacks,
+        too_seldom=_slow_commands(inputs),
+        offers_terms=lambda: _offers_more(inputs, fit),
     )
-    status, flags, why = judged.status, judged.next, list(judged.reasons)
-    # No model explains a motion between commands that the log lacks.
-    if status in (CHANGE, NOT_FINISHED) and (slow := _slow_commands(inputs)):
-        status, flags, why = RECORD, "", [slow, *why]
-    if status == CHANGE and not (flags or lacks.unexplained) and _offers_more(inputs, fit):
-        flags = "--terms auto"
-    reasons = tuple(dict.fromkeys([*why, fault] if fault else why))
-    parameters = document.parameters if status == ACCEPTED else tuple(map(_doubted, document.parameters))
-    judgement = Judgement(status, reasons, flags)
-    return replace(document, verdict=judgement, parameters=parameters, worst=worst)
-
-
-def _fault(worst: WorstSecond | None, document: Identification) -> tuple[str, bool]:
-    """Return a sentence about a second that the model does not explain, and whether the joint's others are better."""
-    if worst is None or not worst.unexplained:
-        return "", False
-    off = document.samples[f"{worst.column}_measured"] - document.samples[f"{worst.column}_identified"]
-    alone = worst.rmse is None or worst.rmse > _ALONE * float(np.sqrt(np.nanmean(off**2)))
-    where = f"the model does not explain {worst.name} in the second from {worst.begin_s:.1f} s on: {worst.error}"
-    return f"{where}; look at the log there", alone
+    accepted = judgement.status == ACCEPTED
+    parameters = document.parameters if accepted else tuple(map(_doubted, document.parameters))
+    return replace(document, verdict=judgement, parameters=parameters)
 
 
 def _slow_commands(inputs: Inputs) -> str:

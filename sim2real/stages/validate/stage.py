@@ -30,7 +30,7 @@ from sim2real.identification.model import IdentifiableModel, measured_channels
 from sim2real.identification.predictions import positions
 from sim2real.identification.residuals import Problem
 from sim2real.identification.segments import Span, check_log, extents
-from sim2real.identification.verdict import ACCEPTED, scores
+from sim2real.identification.verdict import ACCEPTED
 from sim2real.robots.robot import RecordedRobot, Robot
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.load import AnyRobot, defaults_of, load_robot, robot_of
@@ -249,8 +249,8 @@ def score(
                 moves = moving(windows, np.flatnonzero(windows.recording == r))
                 moves = dict(zip(prediction.labels(windows), moves, strict=True))
                 of_log = {name: column[columns["recording"] == r] for name, column in columns.items()}
-                rows = prediction.errors(windows, of_log, list(values), fitting.settle_s, [seconds[r]])
-                for row in (row for row in scores(rows, measured) if moves[row.column]):
+                rows = prediction.errors(of_log, list(values), measured, fitting.settle_s, seconds[r])
+                for row in (row for row in rows if moves[row.column]):
                     limit, factor = limits.get((row.column, kind)), wider.get(row.column, 1.0)
                     found = replace(row, source=log.path.name, kind=kind, seconds=seconds[r], wider=factor)
                     if limit is not None:
