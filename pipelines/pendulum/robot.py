@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from sim2real.hardware.safety.following import Following
     from sim2real.hardware.safety.gate import GateConfig, GateLimits
     from sim2real.hardware.safety.rig import Rig
+    from sim2real.identification.export.mjcf import Late
 
 SERVO_ID = 1
 LIMIT_V = 2.0
@@ -49,13 +50,9 @@ def upright(th: Any, thdot: Any) -> Any:
 class HingeSensor(RobotSensor):
     """The servo's encoder."""
 
-    channels = (Channel("th", "thdot", position_sigma=0.002, velocity_sigma=0.05),)
+    channels = (Channel("th", "thdot", position_sigma=0.002, velocity_sigma=0.05, label=HINGE),)
     units = {"th": "rad", "thdot": "rad/s"}
     at_rest = Measurement(th=np.float64(np.pi), thdot=np.float64(0.0))
-
-    @property
-    def joints(self) -> Mapping[str, Mapping[str, str]]:
-        return {HINGE: {"position": "th", "velocity": "thdot"}}
 
     def read(self, reading: Reading) -> Measurement:
         return Measurement(reading.position_rad[0], reading.velocity_rad_s[0])
@@ -176,8 +173,10 @@ class HingeModel(RobotModel):
         return Following(0.5, 0.3, source="the identified model", push=push)
 
     @property
-    def export_lead_s(self) -> float:
-        return 0.5 * STEP_S
+    def late(self) -> Late:
+        from sim2real.identification.export.mjcf import Late
+
+        return Late(0.5 * STEP_S)
 
     def identified_mjcf(self, values: Mapping[str, Scalar]) -> str:
         return mjcf_of(values)

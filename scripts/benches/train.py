@@ -15,6 +15,7 @@ from benches.rows import Report, Row, row, values
 from sim2real.graph.delays import EmpiricalDist
 from sim2real.graph.schedule import draw
 from sim2real.robots.loop import AGENT
+from sim2real.robots.training import training_loop
 from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.stages.load import load_module, load_robot
 from sim2real.training.config import PPOConfig
@@ -57,7 +58,7 @@ def environment(timelines: int, episode_s: float) -> GraphEnvironment:
     draws["actuator_delay"] = values["actuator_delay"] + rng.uniform(-SPREAD_S, SPREAD_S, DRAWS)
     jitter = rng.gamma(4.0, 2e-4, 2000)
     computation = {n: EmpiricalDist(jitter) for n in ("sensor", "agent", "actuator")}
-    nodes, task = robot.training(values, draws, computation, True)
+    nodes, task = training_loop(robot, values, draws, computation, True)
     graph = CompiledGraph(nodes, AGENT, draw(nodes, episode_s, timelines, 0))
     return GraphEnvironment(graph, task)
 

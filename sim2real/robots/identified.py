@@ -13,12 +13,12 @@ from sim2real.graph.node import BaseNode
 from sim2real.identification.model import Channel
 from sim2real.identification.parameters import Parameter, ParameterTable
 from sim2real.robots.loop import ACTUATOR, SENSOR, WORLD
-from sim2real.robots.robot import RecordedRobot
+from sim2real.robots.robot import RecordedRobot, Simulated
 from sim2real.types import PyTree, Scalar
 from sim2real.worlds.recorded import RecordedActuator
 
 
-class LoggedRobot(RecordedRobot):
+class LoggedRobot(RecordedRobot, Simulated):
     """A ``RecordedRobot`` without a device; subclasses define its nodes and parameters.
 
     Attributes:
@@ -33,6 +33,10 @@ class LoggedRobot(RecordedRobot):
     delayed: str = "command to measurement"
     tick_s: float = 0.0
     burst: int = 0
+
+    @property
+    def simulated(self) -> Simulated:
+        return self
 
     @abstractmethod
     def dynamics(self) -> list[Parameter]:

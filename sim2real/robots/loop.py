@@ -1,29 +1,23 @@
-"""The control loop of sensor, agent, actuator and world: connections, delays, identification, training."""
+"""The control loop of sensor, agent, actuator and world: its names, its connections and its delays."""
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import partial
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sim2real import pytree
-from sim2real.graph.base import Base, GraphState, StepState
+from sim2real.graph.base import Base, GraphState
 from sim2real.graph.delays import TrainableDist
-from sim2real.graph.episode import Episode, named_leaves
 from sim2real.graph.node import BaseNode, Scheduling
-from sim2real.identification.parameters import Parameter, ParameterTable
-from sim2real.later import jax, jnp
-from sim2real.robots.messages import EpisodeStart
-from sim2real.training.environment.tasks import Rewards, TrainingTask
-from sim2real.types import Array, PyTree, Scalar
+from sim2real.identification.parameters import Parameter
+from sim2real.types import PyTree, Scalar
 
 if TYPE_CHECKING:
-    from sim2real.robots.robot import Robot
+    import jax
 
 SENSOR, AGENT, ACTUATOR, WORLD = "sensor", "agent", "actuator", "world"
 """Names of the nodes: what measures, what decides (the policy makes its steps), what sends commands to the motors, and
@@ -37,6 +31,8 @@ DELAYS = ("sensor_delay", "actuator_delay")
 """Names of the two delays: from the world to the sensor, and from the actuator to the world."""
 Draw = Callable[["jax.Array"], dict[str, PyTree]]
 """Draws dynamics and delays of an episode: key -> values by name."""
+DELAY_SPREAD_S = 0.002
+"""Largest deviation, up or down, of an episode's delay from that of the simulated loop [s]."""
 EMPTY: Mapping[str, np.ndarray] = MappingProxyType({})
 """No samples."""
 
@@ -89,7 +85,7 @@ def delay_parameters(max_delay_s: float) -> list[Parameter]:
 def delay_bounds(
     values: Mapping[str, float],
     tick_s: float,
-    spread_s: float,
+    spread_s: float = DELAY_SPREAD_S,
     lead_s: float = 0.0,
     draws: Mapping[str, np.ndarray] = EMPTY,
 ) -> dict[str, tuple[float, float, float]]:
@@ -113,7 +109,7 @@ def delay_bounds(
     return bounds
 
 
-def split_delay(values: Mapping[str, float], tick_s: float, spread_s: float) -> dict[str, float]:
+def split_delay(values: Mapping[str, float], tick_s: float, spread_s: float = DELAY_SPREAD_S) -> dict[str, float]:
     """Return parameters with part of the actuator's delay moved to the sensor, as far as a simulated loop needs it.
 
     The simulated sensor interpolates between ticks of the world, so its delay must be at least one tick: the next tick
@@ -211,143 +207,3 @@ def recorded_loop(
     world.connect(actuator, skip=True, delay_dist=to_world)
     sensor.connect(world, delay_dist=TrainableDist.create(start, 0.0, max_delay_s + ahead_s, "linear"))
     return {n.name: n for n in (sensor, actuator, world)}
-
-
-def draw_values(key: jax.Array, values: Mapping[str, float], draws: Mapping[str, jax.Array]) -> dict[str, PyTree]:
-    """Draw the parameters of one episode.
-
-    Args:
-        draws: Samples of some parameters, each of shape ``(K,)``; one of the K joint samples is drawn in place of the
-            values.
-
-    Returns:
-        Parameters by name.
-    """
-    count = min((len(d) for d in draws.values()), default=1)
-    row = jax.random.randint(key, (), 0, count)
-    return {name: draws[name][row] if name in draws else value for name, value in values.items()}
-
-
-class IdentifiableLoop:
-    """Simulates the sensor's measurements from recorded commands; an ``identification.model.IdentifiableModel``.
-
-    Args:
-        max_delay_s: Upper bound of each of the two delays [s].
-    """
-
-    sensor = SENSOR
-
-    def __init__(self, robot: Robot, max_delay_s: float) -> None:
-        self._robot = robot
-        self.parameters = ParameterTable([*robot.model.dynamics(), *delay_parameters(max_delay_s)])
-        self.ahead_s, self.channels = robot.model.tick_s, robot.sensor.channels
-        message = robot.sim_actuator().init_output()
-        fields = pytree.structure(message).unflatten(list(named_leaves(message)))
-        self.given: Mapping[str, PyTree] = {ACTUATOR: fields}
-        self._aim = np.zeros_like(robot.task.at_rest(0).aim)
-
-    def nodes(self, max_delay_s: float) -> dict[str, BaseNode]:
-        """Return sensor, actuator and world, connected with delays of up to ``max_delay_s`` [s]."""
-        robot, world = self._robot, self._robot.model.make_world(resumed=True)
-        sensor = robot.sim_sensor(world)
-        return recorded_loop(sensor, robot.sim_actuator(), world, max_delay_s, self.ahead_s, robot.model.lead_s)
-
-    def reached(self, recordings: Sequence[Episode]) -> Mapping[str, float]:
-        """Return an empty dict: there are no limits among the optional terms."""
-        return {}
-
-    def params(self, values: Mapping[str, Scalar], start: Array) -> dict[str, PyTree]:
-        """Return the nodes' parameters.
-
-        Args:
-            start: Shape ``(2 * channels,)``: initial positions, then velocities.
-        """
-        position, velocity = jnp.split(jnp.asarray(start), 2, axis=-1)
-        params = self._robot.node_parameters(values, EpisodeStart(position, velocity, self._aim))
-        del params[AGENT]
-        return {**params, SENSOR: DelayParams(values[DELAYS[0]] + self.ahead_s)}
-
-
-class LoopTask(TrainingTask):
-    """The training task of a robot in a loop.
-
-    Args:
-        draws: Samples of some parameters, each of shape ``(K,)``; one of the K joint samples is drawn for each episode
-            in place of the values.
-
-    Attributes:
-        start: Largest change of a joint's position [rad] and of its velocity [rad/s] at the start of an episode.
-    """
-
-    supervisor = AGENT
-    has_curriculum = True
-
-    def __init__(self, robot: Robot, agent: Any, values: Mapping[str, float], draws: Mapping[str, np.ndarray]) -> None:
-        self.robot, self.agent = robot, agent
-        self.values: dict[str, PyTree] = dict(values)
-        self.draws = {n: jnp.asarray(d, jnp.float32) for n, d in draws.items()}
-        self.observation_size = robot.agent.observation_size
-        self.start = (0.0, 0.0)
-        self.action_low, self.action_high = np.array([(t.low, t.high) for t in robot.agent.action], np.float32).T
-
-    @property
-    def data(self) -> PyTree:
-        """The values and samples of the parameters; see ``HoldsData``."""
-        return {n: jnp.asarray(v, jnp.float32) for n, v in self.values.items()}, self.draws
-
-    def with_data(self, data: PyTree) -> LoopTask:
-        """Return a copy with other values and samples, which may be traced."""
-        task = copy.copy(self)
-        task.values, task.draws = data
-        return task
-
-    def params(self, key: jax.Array, width: jax.Array | None = None) -> dict[str, PyTree]:
-        draw, task = partial(self._draw, width=width), self.robot.task
-        # Draw values and start; then move the start, and scale the noise.
-        if any(self.start):
-            key, key_start = jax.random.split(key)
-            values, start = task.random(key, draw)
-            start = task.moved(start, *self.offsets(key_start, width))
-        else:
-            values, start = task.random(key, draw)
-        if width is None:
-            return self.robot.node_parameters(values, start)
-        params = self.robot.node_parameters(values, task.narrowed(start, width))
-        return {**params, SENSOR: params[SENSOR].replace(noise=width)}
-
-    def offsets(self, key: jax.Array, width: jax.Array | None) -> tuple[jax.Array, jax.Array]:
-        """Draw the offsets of an episode's start: positions [rad] and velocities [rad/s], ``(joints,)`` each.
-
-        Args:
-            width: Share of the differences; None: all of them.
-        """
-        share = 1.0 if width is None else width
-        drawn = share * jax.random.uniform(key, (2, len(self.robot.sensor.channels)), minval=-1.0, maxval=1.0)
-        return self.start[0] * drawn[0], self.start[1] * drawn[1]
-
-    def observe(self, step_state: StepState) -> jax.Array:
-        return self.agent.observe(step_state)
-
-    def act(self, step_state: StepState, action: jax.Array) -> tuple[StepState, PyTree]:
-        return self.agent.act(step_state, action)
-
-    def reward(self, graph_state: GraphState, action: jax.Array) -> Rewards:
-        return self.robot.task.reward(self.robot.task.judged(graph_state), action)
-
-    def success(self, graph_state: GraphState) -> jax.Array:
-        return self.robot.task.success(self.robot.task.judged(graph_state))
-
-    def terminated(self, graph_state: GraphState) -> jax.Array:
-        return self.robot.task.terminated(self.robot.task.judged(graph_state))
-
-    def privileged(self, graph_state: GraphState) -> jax.Array:
-        state = self.robot.model.true_state(graph_state.state[WORLD])
-        numbers = [x for x in map(jnp.asarray, jax.tree.leaves((state, graph_state.params)))]
-        numbers = [x for x in numbers if jnp.issubdtype(x.dtype, jnp.inexact)]
-        return jnp.concatenate([x.astype(jnp.float32).ravel() for x in numbers])
-
-    def _draw(self, key: jax.Array, width: jax.Array | None) -> dict[str, PyTree]:
-        drawn = draw_values(key, self.values, self.draws)
-        if width is None:
-            return drawn
-        return {n: value + width * (drawn[n] - value) if n in self.draws else value for n, value in self.values.items()}

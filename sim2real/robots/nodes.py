@@ -1,4 +1,4 @@
-"""The nodes of a robot's loop: sensor and actuator in simulation, sensor, actuator and agent on hardware.
+"""The nodes of a robot's loop: sensor and actuator in simulation; and on hardware, with the robot's connection.
 
 Imports no MuJoCo, which would take seconds.
 """
@@ -6,7 +6,9 @@ Imports no MuJoCo, which would take seconds.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Unpack
 
 import numpy as np
@@ -18,13 +20,15 @@ from sim2real.graph.base import Base, GraphState, StepState, Value
 from sim2real.graph.node import BaseNode, NodeOptions
 from sim2real.later import jax, jnp
 from sim2real.policy.runner import Runner
-from sim2real.robots.loop import AGENT, DelayParams, delay_of
+from sim2real.robots.loop import ACTUATOR, AGENT, SENSOR, DelayParams, control_nodes, delay_of
 from sim2real.robots.messages import Goals
 from sim2real.types import Array, Key, PyTree
 
 if TYPE_CHECKING:
     from sim2real.hardware.device import Reading
+    from sim2real.hardware.safety.gate import GateLimits
     from sim2real.hardware.safety.rig import Rig
+    from sim2real.robots.robot import Robot, RobotDrive
 
 
 # -- in simulation
@@ -319,3 +323,100 @@ class PolicyNode(BaseNode):
 def in_numpy(tree: PyTree) -> PyTree:
     """Return a pytree with numpy arrays for leaves: an array of JAX turns every later computation into one of JAX."""
     return pytree.map(np.asarray, tree)
+
+
+# -- the robot on hardware, and its graph
+
+_HOLD_S, _HANG_S = 1.0, 20.0
+"""How long an excitation's last goals are repeated; longest time for joints to come to rest before it [s]."""
+_STILL_RAD_S = 0.3
+"""Speed below which a joint is at rest, above the noise of motors' speeds [rad/s]."""
+HOME_RAD_S = 1.0
+"""Speed of joints on the way to the first goals of an excitation, or to the rest pose."""
+
+
+@contextmanager
+def connected(
+    drive: RobotDrive, port: str, limits: GateLimits, truth_path: Path, seed: int, hanging: bool = False
+) -> Iterator[Rig]:
+    """Open a robot for the block, with torque off; at its end the torque is off and the port is closed.
+
+    Args:
+        port: Device file of the port, or ``embedded`` for the emulated robot.
+        truth_path: File for the emulated robot's true states and latencies.
+        seed: Seed of the emulated robot's jitter and faults.
+        hanging: Whether a robot on legs hangs in a stand, to be recorded.
+
+    Raises:
+        UsageError: The port is ``embedded``, but the robot has none.
+        HardwareLost: The device cannot be opened, or a motor does not answer.
+    """
+    # Imported here: training also makes robots, and must not import their drivers.
+    from sim2real.hardware.safety.rig import Rig
+
+    with ExitStack() as stack:
+        is_embedded = port == "embedded"
+        if is_embedded:
+            if (embedded := drive.embedded(hanging)) is None:
+                raise UsageError("this robot has no embedded twin", hint="name its port with --port")
+            robot = stack.enter_context(embedded.start(truth_path, seed, drive.mounting))
+            port = robot.port
+            # Wait until the last command, torque off, has taken effect, so that it is in the truth file.
+            config = embedded.emulator
+            stack.callback(robot.sleep, config.actuation_latency_s + config.actuation_jitter_s + 0.01)
+        device = drive.device(port, limits.servo_watchdog_s, is_embedded)
+        yield stack.enter_context(Rig(device, drive.gate(limits, device), drive.mounting))
+
+
+def recording_nodes(robot: Robot, rig: Rig, signal: np.ndarray | None, standing: bool = False) -> dict[str, BaseNode]:
+    """Return the graph on hardware that plays an excitation ``(N,)`` or ``(N, actions)``, one row a step.
+
+    Goals of joints begin where the joints are. Without an excitation the graph only measures: it has the sensor alone,
+    and no node sends a command.
+
+    Args:
+        standing: Whether it begins as the task does, such as by standing up.
+    """
+    if signal is None:
+        return {SENSOR: _sensor(robot, rig)}
+    drive = robot.drive
+    rows = np.asarray(signal, np.float64).reshape(-1, len(robot.agent.action)) + drive.centre
+    if not standing and robot.units.get(drive.command) == "rad":
+        rows = approached(rows, rig.wait_until_still(_HANG_S, _STILL_RAD_S).position_rad, drive.rate_hz)
+    player = Excitation(AGENT, drive.rate_hz, rows, drive.message, delay=drive.expected_delay_s[1])
+    return _on_hardware(robot, rig, player, (lambda: drive.begin(rig)) if standing else None)
+
+
+def deployment_nodes(
+    robot: Robot, rig: Rig, policy: Runner, trial: int = 0
+) -> tuple[dict[str, BaseNode], dict[str, PyTree]]:
+    """Return the graph on hardware that runs a policy, and the agent's parameters: it starts where the robot is.
+
+    Args:
+        policy: ``reset()`` begins an episode; a call with an observation ``(O,)`` returns the action ``(A,)``.
+    """
+    drive, measured = robot.drive, np.asarray(rig.measure().position_rad, np.float32)
+    start = robot.task.at_rest(trial).replace(position=measured)
+    params = {AGENT: in_numpy(robot.agent.params(start, None))}
+    node = PolicyNode(robot.agent.make(drive.rate_hz, delay=drive.expected_delay_s[1]), policy)
+    return _on_hardware(robot, rig, node, lambda: drive.begin(rig)), params
+
+
+def approached(goals: np.ndarray, position_rad: np.ndarray, rate_hz: float) -> np.ndarray:
+    """Return goals ``(N, joints)`` that begin at positions ``(joints,)`` and reach the given goals at 1 rad/s [rad]."""
+    # Repeat the last goals: joints that began farther away than the excitation lasts go on towards them.
+    goals = np.vstack([goals, np.repeat(goals[-1:], round(_HOLD_S * rate_hz), axis=0)])
+    offset = position_rad - goals[0]
+    covered = np.arange(len(goals))[:, None] * HOME_RAD_S / rate_hz
+    return goals + np.sign(offset) * np.maximum(np.abs(offset) - covered, 0.0)
+
+
+def _on_hardware(robot: Robot, rig: Rig, agent: BaseNode, begin: Callable[[], None] | None) -> dict[str, BaseNode]:
+    drive, options = robot.drive, {"begin": begin, "delay": robot.drive.expected_delay_s[2]}
+    actuator = ServoActuator(ACTUATOR, drive.rate_hz, rig, drive.command, drive.message, **options)
+    return control_nodes(_sensor(robot, rig), agent, actuator)
+
+
+def _sensor(robot: Robot, rig: Rig) -> ServoSensor:
+    sensor, drive = robot.sensor, robot.drive
+    return ServoSensor(SENSOR, drive.rate_hz, rig, sensor.read, sensor.at_rest, delay=drive.expected_delay_s[0])

@@ -8,10 +8,8 @@ refuses one without the methods that have no default.
 from __future__ import annotations
 
 import copy
-import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -21,32 +19,15 @@ import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState
-from sim2real.graph.delays import DelayDistribution
 from sim2real.graph.node import BaseNode, NodeOptions
 from sim2real.identification.model import Channel, IdentifiableModel, PlainSimulation, position_of
 from sim2real.identification.parameters import Parameter
 from sim2real.later import jax, jnp
 from sim2real.policy.contract import ActionTerm, ObservationTerm
-from sim2real.policy.runner import Runner
-from sim2real.robots.loop import (
-    ACTUATOR,
-    AGENT,
-    DELAYS,
-    SENSOR,
-    WORLD,
-    DelayParams,
-    Draw,
-    IdentifiableLoop,
-    LoopTask,
-    control_nodes,
-    delay_bounds,
-    simulated_loop,
-    split_delay,
-    split_drawn_delay,
-)
+from sim2real.robots.loop import WORLD, Draw
 from sim2real.robots.messages import EpisodeStart
-from sim2real.robots.nodes import Excitation, PolicyNode, ServoActuator, ServoSensor, SimActuator, SimSensor, in_numpy
 from sim2real.robots.probe import Probe
+from sim2real.robots.training import IdentifiableLoop
 from sim2real.training.environment.tasks import Rewards
 from sim2real.types import Array, Key, PyTree, Scalar
 
@@ -58,6 +39,7 @@ if TYPE_CHECKING:
     from sim2real.hardware.safety.following import Following
     from sim2real.hardware.safety.gate import GateConfig, GateLimits
     from sim2real.hardware.safety.rig import Rig
+    from sim2real.identification.export.mjcf import Late
     from sim2real.log.importing.mapping import ImportMapping
     from sim2real.stages.config import Defaults
 
@@ -72,24 +54,25 @@ class Embedded:
     Attributes:
         plant: Returns its physics: a ``Plant`` or a ``Body`` of ``sim2real.emulation.plant``.
         emulator: Latencies and faults; its seed is replaced by that of the stage.
+        zero_rad: Reading of an encoder, from count 0, at the device's 0 [rad].
     """
 
     plant: Callable[[], Any]
     emulator: Emulation
+    zero_rad: float = 0.0
 
-    def start(self, truth_path: Path, seed: int, joints: Sequence[Joint] = (), zero_rad: float = 0.0) -> VirtualTime:
+    def start(self, truth_path: Path, seed: int, joints: Sequence[Joint] = ()) -> VirtualTime:
         """Return the running robot.
 
         Args:
             truth_path: File for its true states and latencies.
             joints: Its mounted joints, in the order of the plant's ``servo_ids``.
-            zero_rad: Reading of an encoder, from count 0, at the device's 0 [rad].
         """
         from sim2real.emulation.plant import MountedPlant
 
         plant = self.plant()
         if not all(joint.is_plain for joint in joints):
-            plant = MountedPlant(plant, joints, zero_rad)
+            plant = MountedPlant(plant, joints, self.zero_rad)
         truth_path.parent.mkdir(parents=True, exist_ok=True)
         return replace(self.emulator, seed=seed).robot(plant, truth_path)
 
@@ -109,15 +92,6 @@ class RobotSensor(ABC):
     at_rest: PyTree
     noise: tuple[Noise, ...] = ()
 
-    @property
-    def joints(self) -> Mapping[str, Mapping[str, str]]:
-        """Joint -> quantity -> field of the message, for the log; see ``McapRecorder``."""
-        rows = {}
-        for c in self.channels:
-            index = "" if c.index is None else f"[{c.index}]"
-            rows[c.name] = {"position": position_of(c)} | ({"velocity": f"{c.velocity}{index}"} if c.velocity else {})
-        return rows
-
     @abstractmethod
     def read(self, reading: Reading) -> PyTree:
         """Return the message of a reading."""
@@ -134,8 +108,8 @@ class RobotDrive(ABC):
         expected_delay_s: Computation delays of sensor, agent and actuator that phases allow for: a bus transaction, and
             a policy with its thread's wake-up [s].
         centre: Commands around which an excitation moves, ``(actions,)``.
+        crouch: Offset from these with which a robot on its feet bends its legs ``(actions,)``; None: it has no feet.
         probe: The steps by which deploy measures the delay; None: the delay is not measured.
-        zero_rad: Reading of the emulated encoders, from count 0, at the device's 0 [rad].
     """
 
     rate_hz: float
@@ -144,8 +118,8 @@ class RobotDrive(ABC):
     message: Callable[[PyTree], PyTree]
     expected_delay_s: tuple[float, float, float] = (0.002, 0.002, 0.002)
     centre: np.ndarray | float = 0.0
+    crouch: np.ndarray | None = None
     probe: Probe | None = None
-    zero_rad: float = 0.0
 
     @abstractmethod
     def device(self, port: str, silence_s: float, embedded: bool) -> Device:
@@ -169,39 +143,6 @@ class RobotDrive(ABC):
         """
         return None
 
-    @contextmanager
-    def connect(
-        self, port: str, limits: GateLimits, truth_path: Path, seed: int, hanging: bool = False
-    ) -> Iterator[Rig]:
-        """Open the robot for the block, with torque off; at its end the torque is off and the port is closed.
-
-        Args:
-            port: Device file of the port, or ``embedded`` for the emulated robot.
-            truth_path: File for the emulated robot's true states and latencies.
-            seed: Seed of the emulated robot's jitter and faults.
-            hanging: Whether a robot on legs hangs in a stand, to be recorded.
-
-        Raises:
-            UsageError: The port is ``embedded``, but the robot has none.
-            HardwareLost: The device cannot be opened, or a motor does not answer.
-        """
-        # Imported here: training also makes robots, and must not import their drivers.
-        from sim2real.hardware.safety.rig import Rig
-
-        with ExitStack() as stack:
-            is_embedded = port == "embedded"
-            if is_embedded:
-                if (embedded := self.embedded(hanging)) is None:
-                    raise UsageError("this robot has no embedded twin", hint="name its port with --port")
-                robot = stack.enter_context(embedded.start(truth_path, seed, self.mounting, self.zero_rad))
-                port = robot.port
-                # Wait until the last command, torque off, has taken effect, so that it is in the truth file.
-                config = embedded.emulator
-                lasts_s = config.actuation_latency_s + config.actuation_jitter_s + 0.01
-                stack.callback(robot.sleep, lasts_s)
-            device = self.device(port, limits.servo_watchdog_s, is_embedded)
-            yield stack.enter_context(Rig(device, self.gate(limits, device), self.mounting))
-
     @abstractmethod
     def prepare(self, rig: Rig, settle_s: float) -> None:
         """Bring the robot to rest where the task starts; torque is off afterwards.
@@ -223,18 +164,6 @@ class RobotDrive(ABC):
             device: The device, whose commands may have columns; None: the limits of an excitation.
         """
         return limits.gate(limits.limit)
-
-    def standing(self, duration_s: float) -> np.ndarray | None:
-        """Return the excitation ``(N, actions)`` of a robot on its feet; None: it has no feet."""
-        return None
-
-    def approach(self, rig: Rig, commands: np.ndarray) -> np.ndarray:
-        """Return the commands ``(N, actions)`` with a way to the first of them, from where the robot is; default: none.
-
-        Args:
-            commands: Those of the excitation.
-        """
-        return commands
 
 
 class RobotAgent(ABC):
@@ -284,13 +213,13 @@ class RobotTask(ABC):
     def at_rest(self, trial: int) -> EpisodeStart:
         """Return the start at rest of a trial. The same number gives the same aim, on hardware and in simulation."""
 
-    def moved(self, start: EpisodeStart, position: Array, velocity: Array) -> EpisodeStart:
-        """Return a start with an offset of positions ``(channels,)`` [rad] and velocities [rad/s]."""
-        return start.replace(position=start.position + position, velocity=start.velocity + velocity)
+    def moved(self, start: EpisodeStart, position: Array, velocity: Array, share: Scalar = 1.0) -> EpisodeStart:
+        """Return a start with an offset of positions ``(channels,)`` [rad] and velocities [rad/s].
 
-    def narrowed(self, start: EpisodeStart, share: Array) -> EpisodeStart:
-        """Return a start with a share ``()`` of the task's difficulty, for a curriculum; default: all of it."""
-        return start
+        Args:
+            share: Share ``()`` of the task's difficulty, for a curriculum; default: it changes nothing.
+        """
+        return start.replace(position=start.position + position, velocity=start.velocity + velocity)
 
     def judged(self, graph_state: GraphState) -> PyTree:
         """Return the state that ``reward``, ``success`` and ``terminated`` evaluate; default: the world's."""
@@ -327,19 +256,24 @@ class Simulated:
     """What exports and the drift test ask of a robot's model.
 
     Attributes:
-        profile_rad_s: Speed of the actuators' setpoints towards their goals [rad/s]; infinite: at once.
         causes: Causes that change several parameters at once: name -> parameter -> change of the parameter on its scale
             when the cause grows by a factor of e.
-        export_lead_s: Time that a simulation of ``identified_mjcf`` in C MuJoCo adds to the delay of commands [s].
+        watched_terms: Optional terms that may change between deployments, such as a payload.
     """
 
-    profile_rad_s: float = math.inf
     causes: Mapping[str, Mapping[str, float]] = _NOTHING
-    export_lead_s: float = 0.0
+    watched_terms: tuple[str, ...] = ()
 
     def identified_mjcf(self, values: Mapping[str, Scalar]) -> str | None:
         """Return the model with identified values, as MJCF; None: there is none."""
         return None
+
+    @property
+    def late(self) -> Late:
+        """The timing in C MuJoCo that the text of this MJCF does not hold; default: none."""
+        from sim2real.identification.export.mjcf import Late
+
+        return Late()
 
     def plain_simulation(self, values: Mapping[str, float]) -> PlainSimulation | None:
         """Return the robot with identified values as a simulation in plain MuJoCo; None: there is none."""
@@ -353,14 +287,10 @@ class RobotModel(Simulated, ABC):
 
     Attributes:
         tick_s: The world's period [s].
-        lead_s: Time that the world adds to the actuator's delay [s]; see ``MjxWorld``.
-        watched_terms: Optional terms that may change between deployments.
         needs_gpu: Whether a training takes hours without a GPU.
     """
 
     tick_s: float
-    lead_s: float = 0.0
-    watched_terms: tuple[str, ...] = ()
     needs_gpu: bool = False
 
     @abstractmethod
@@ -369,7 +299,10 @@ class RobotModel(Simulated, ABC):
 
     @abstractmethod
     def make_world(self, resumed: bool = False) -> BaseNode:
-        """Return the world's node; ``resumed``: episodes begin in the middle of a recording."""
+        """Return the world's node; ``resumed``: episodes begin in the middle of a recording.
+
+        A world with a ``lead_s`` adds that time to the actuator's delay [s].
+        """
 
     @abstractmethod
     def params(self, values: Mapping[str, Scalar], start: EpisodeStart) -> PyTree:
@@ -392,7 +325,7 @@ class RobotModel(Simulated, ABC):
         return None
 
 
-class RecordedRobot(Simulated, ABC):
+class RecordedRobot(ABC):
     """A robot that was recorded: what identification needs.
 
     Attributes:
@@ -412,21 +345,14 @@ class RecordedRobot(Simulated, ABC):
     def __init_subclass__(cls) -> None:
         cls.name = cls.__name__
 
-    def called_like(self, other: RecordedRobot) -> Self:
-        """Give this robot the name, the folder and the defaults of another one, and return it."""
-        self.name, self.folder, self.defaults, self.mapping = other.name, other.folder, other.defaults, other.mapping
-        return self
-
     @abstractmethod
     def identifiable(self, max_delay_s: float) -> IdentifiableModel:
         """Return the model to identify, with delays of up to ``max_delay_s`` [s]."""
 
-    def watched(self, max_delay_s: float) -> IdentifiableModel:
-        """Return the model with all parameters that may change between deployments; default: as ``identifiable``.
-
-        Further parameters, such as a payload, have their nominal values at the time of the identification.
-        """
-        return self.identifiable(max_delay_s)
+    @property
+    def simulated(self) -> Simulated:
+        """What exports and the drift test ask of its model; default: nothing."""
+        return Simulated()
 
     def with_optional_terms(self, wanted: str) -> RecordedRobot:
         """Return the robot with further optional terms; default: the robot, which has all of them.
@@ -445,7 +371,6 @@ class Robot(RecordedRobot):
     """A robot that can be recorded, trained for and deployed to. It has five parts, which its ``__init__`` sets.
 
     Attributes:
-        delay_spread_s: Largest deviation, up or down, of an episode's delay from that of the simulated loop [s].
         tasks: Further tasks by name, each with its agent; see ``with_task``.
     """
 
@@ -454,10 +379,7 @@ class Robot(RecordedRobot):
     agent: RobotAgent
     task: RobotTask
     model: RobotModel
-    delay_spread_s: float = 0.002
     tasks: Mapping[str, tuple[RobotAgent, RobotTask]] = _NOTHING
-
-    # -- what its parts say
 
     @property
     def rate_hz(self) -> float:
@@ -469,16 +391,8 @@ class Robot(RecordedRobot):
         return {**self.sensor.units, **self.drive.units, **self.agent.units}
 
     @property
-    def profile_rad_s(self) -> float:
-        return self.model.profile_rad_s
-
-    @property
-    def causes(self) -> Mapping[str, Mapping[str, float]]:
-        return self.model.causes
-
-    @property
-    def export_lead_s(self) -> float:
-        return self.model.export_lead_s
+    def simulated(self) -> RobotModel:
+        return self.model
 
     def nominal(self) -> dict[str, float]:
         """Return the nominal values of the model's parameters, without delays."""
@@ -486,17 +400,6 @@ class Robot(RecordedRobot):
 
     def identifiable(self, max_delay_s: float) -> IdentifiableModel:
         return IdentifiableLoop(self, max_delay_s)
-
-    def watched(self, max_delay_s: float) -> IdentifiableModel:
-        loop = self.identifiable(max_delay_s)
-        loop.parameters = loop.parameters.with_terms([*loop.parameters.terms, *self.model.watched_terms])
-        return loop
-
-    def in_model(self, model: RobotModel) -> Self:
-        """Return the robot in another simulation."""
-        moved = copy.copy(self)
-        moved.model = model
-        return moved
 
     def with_task(self, name: str) -> Self:
         """Return the robot with another of its tasks, such as ``follow`` of an arm; identifications stay valid.
@@ -511,125 +414,6 @@ class Robot(RecordedRobot):
         robot = copy.copy(self)
         robot.agent, robot.task = self.tasks[name]
         return robot
-
-    def identified_mjcf(self, values: Mapping[str, Scalar]) -> str | None:
-        return self.model.identified_mjcf(values)
-
-    def plain_simulation(self, values: Mapping[str, float]) -> PlainSimulation | None:
-        return self.model.plain_simulation(values)
-
-    # -- graphs on hardware
-
-    def recording_nodes(self, rig: Rig, signal: np.ndarray | None, standing: bool = False) -> dict[str, BaseNode]:
-        """Return the graph on hardware that plays an excitation ``(N,)`` or ``(N, actions)``, one row a step.
-
-        Without an excitation it only measures: it has the sensor alone, and no node sends a command.
-
-        Args:
-            standing: Whether it begins as the task does, such as by standing up.
-        """
-        if signal is None:
-            return {SENSOR: self._sensor(rig)}
-        drive = self.drive
-        rows = np.asarray(signal, np.float64).reshape(-1, len(self.agent.action)) + drive.centre
-        rows = rows if standing else drive.approach(rig, rows)
-        player = Excitation(AGENT, self.rate_hz, rows, drive.message, delay=drive.expected_delay_s[1])
-        return self._on_hardware(rig, player, (lambda: drive.begin(rig)) if standing else None)
-
-    def deployment_nodes(
-        self, rig: Rig, policy: Runner, trial: int = 0
-    ) -> tuple[dict[str, BaseNode], dict[str, PyTree]]:
-        """Return the graph on hardware that runs a policy, and the agent's parameters: it starts where the robot is.
-
-        Args:
-            policy: ``reset()`` begins an episode; a call with an observation ``(O,)`` returns the action ``(A,)``.
-        """
-        measured = np.asarray(rig.measure().position_rad, np.float32)
-        start = self.task.at_rest(trial).replace(position=measured)
-        params = {AGENT: in_numpy(self.agent.params(start, None))}
-        node = self.agent.make(self.rate_hz, delay=self.drive.expected_delay_s[1])
-        return self._on_hardware(rig, PolicyNode(node, policy), lambda: self.drive.begin(rig)), params
-
-    def _on_hardware(self, rig: Rig, agent: BaseNode, begin: Callable[[], None] | None) -> dict[str, BaseNode]:
-        drive, options = self.drive, {"begin": begin, "delay": self.drive.expected_delay_s[2]}
-        actuator = ServoActuator(ACTUATOR, self.rate_hz, rig, drive.command, drive.message, **options)
-        return control_nodes(self._sensor(rig), agent, actuator)
-
-    def _sensor(self, rig: Rig) -> ServoSensor:
-        read, rest, delay_s = self.sensor.read, self.sensor.at_rest, self.drive.expected_delay_s[0]
-        return ServoSensor(SENSOR, self.rate_hz, rig, read, rest, delay=delay_s)
-
-    # -- graphs in simulation
-
-    def training(
-        self,
-        values: Mapping[str, float],
-        draws: Mapping[str, np.ndarray],
-        computation: Mapping[str, DelayDistribution],
-        delays: bool,
-    ) -> tuple[dict[str, BaseNode], LoopTask]:
-        """Return the graph in simulation, and the training task.
-
-        Args:
-            draws: Samples of some parameters, each of shape ``(K,)``; an episode uses one of the K joint samples in
-                place of the values.
-            computation: Node -> distribution of its computation delay.
-            delays: Whether the connections have delays.
-        """
-        robot, rate = self.in_model(self.model.for_training(values, draws)), self.rate_hz
-        tick_s = robot.model.tick_s
-        # Share the delays between sensor and actuator as a simulated loop needs, and make room for all draws.
-        draws = split_drawn_delay(values, draws, tick_s, self.delay_spread_s)
-        values = split_delay(values, tick_s, self.delay_spread_s)
-        bounds = delay_bounds(values, tick_s, self.delay_spread_s, robot.model.lead_s, draws) if delays else None
-        on_sensor, on_agent, on_actuator = (
-            {"delay": delay_s if delays else 0.0, "delay_dist": computation.get(name)}
-            for name, delay_s in zip((SENSOR, AGENT, ACTUATOR), self.drive.expected_delay_s, strict=True)
-        )
-        # Make the nodes and connect them.
-        world, agent = robot.model.make_world(), self.agent.make(rate, **on_agent)
-        sensor = self.sim_sensor(world, **on_sensor)
-        sensor.noise = self.sensor.noise
-        nodes = simulated_loop(sensor, agent, self.sim_actuator(**on_actuator), world, bounds)
-        return nodes, LoopTask(robot, agent, values, draws)
-
-    def simulation_params(
-        self, values: Mapping[str, float], policy: PyTree, trial: int = 0, measured: np.ndarray | None = None
-    ) -> dict[str, PyTree]:
-        """Return the nodes' parameters for an episode in simulation that starts at rest.
-
-        Args:
-            measured: Positions ``(channels,)`` where the robot rested, which may differ from the task's by friction.
-        """
-        values, start = split_delay(values, self.model.tick_s, self.delay_spread_s), self.task.at_rest(trial)
-        if measured is not None:
-            offset = measured - np.asarray(start.position)
-            angles = [self.sensor.units.get(channel.position) == "rad" for channel in self.sensor.channels]
-            # Whole turns of a hinge without range are no offset.
-            offset -= np.where(angles, 2 * np.pi * np.round(offset / (2 * np.pi)), 0.0)
-            # Not `moved`, which keeps drawn starts within the bounds of goals: a robot may rest beyond them, on a stop.
-            start = start.replace(position=start.position + offset)
-        return self.node_parameters(values, start, policy)
-
-    def node_parameters(
-        self, values: Mapping[str, Scalar], start: EpisodeStart, policy: PyTree = None
-    ) -> dict[str, PyTree]:
-        """Return the parameters of all nodes in simulation, from values by name and a start."""
-        return {
-            WORLD: self.model.params(values, start),
-            SENSOR: DelayParams(delay=values.get(DELAYS[0])),
-            ACTUATOR: DelayParams(delay=values.get(DELAYS[1])),
-            AGENT: self.agent.params(start, policy),
-        }
-
-    def sim_sensor(self, world: BaseNode, **options: Unpack[NodeOptions]) -> SimSensor:
-        """Return the encoders in simulation, without noise."""
-        return SimSensor(SENSOR, self.rate_hz, world, **options)
-
-    def sim_actuator(self, **options: Unpack[NodeOptions]) -> SimActuator:
-        """Return the bus in simulation."""
-        drive = self.drive
-        return SimActuator(ACTUATOR, self.rate_hz, len(self.agent.action), drive.command, drive.message, **options)
 
 
 PARTS: Mapping[str, type] = {
@@ -678,6 +462,14 @@ def _unset(owner: object, kind: type) -> list[str]:
     return [name for name in kind.__annotations__ if name not in vars(kind) and not hasattr(owner, name)]
 
 
+def watched(robot: RecordedRobot, max_delay_s: float) -> IdentifiableModel:
+    """Return the model to identify with all parameters that may change between deployments, such as a payload."""
+    model = robot.identifiable(max_delay_s)
+    if terms := robot.simulated.watched_terms:
+        model.parameters = model.parameters.with_terms([*model.parameters.terms, *terms])
+    return model
+
+
 def in_world(robot: AnyRobot, name: str | None) -> AnyRobot:
     """Return a robot in the world of a name: an installed package provides its model.
 
@@ -701,7 +493,18 @@ def in_world(robot: AnyRobot, name: str | None) -> AnyRobot:
         raise UsageError(f"world {name!r} makes a {type(model).__name__}", hint="sim2real.robots.robot.RobotModel")
     if (node := model.make_world().name) != WORLD:
         raise UsageError(f"the node of world {name!r} is called {node!r}", hint=f"robots call it {WORLD!r}")
-    return robot.in_model(model)
+    robot = copy.copy(robot)
+    robot.model = model
+    return robot
+
+
+def joint_columns(channels: Sequence[Channel]) -> Mapping[str, Mapping[str, str]]:
+    """Return joint -> quantity -> column of the sensor's message, for the log; see ``McapRecorder``."""
+    rows = {}
+    for c in channels:
+        index = "" if c.index is None else f"[{c.index}]"
+        rows[c.name] = {"position": position_of(c)} | ({"velocity": f"{c.velocity}{index}"} if c.velocity else {})
+    return rows
 
 
 def as_columns(fields: Mapping[str, PyTree]) -> dict[str, np.ndarray]:

@@ -23,7 +23,9 @@ from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.safety.gate import GateLimits
 from sim2real.identification.model import IdentifiableModel
 from sim2real.robots.loop import ACTUATOR, AGENT, SENSOR, WORLD
+from sim2real.robots.nodes import connected
 from sim2real.robots.robot import RecordedRobot, Robot, as_columns, as_sent, checked
+from sim2real.robots.training import simulation_params, training_loop
 from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.training.environment.tasks import TrainingTask, terms_of
 from sim2real.types import PyTree
@@ -84,36 +86,26 @@ def check_simulation(robot: Robot) -> None:
     for name, value in values.items():
         p = identifiable[name]
         _hold(p.low <= value <= p.high, f"{name} = {value} is outside its bounds")
-    nodes, task = robot.training(values, {}, {}, False)
+    nodes, task = training_loop(robot, values, {}, {}, False)
     _include(nodes, {SENSOR, AGENT, ACTUATOR, WORLD}, "nodes of the loop")
-    _hold(task.supervisor == AGENT, f"the task's supervisor is {task.supervisor!r}")
-    for sign, limit in (("low", task.action_low), ("high", task.action_high)):
-        limits = np.array([getattr(term, sign) for term in robot.agent.action], np.float32)
-        _hold(np.shape(limit) == limits.shape, f"the task has {np.shape(limit)} actions, the robot {limits.shape}")
-        excess = (limit - limits) * (1 if sign == "high" else -1)
-        _hold(bool((excess <= 0).all()), f"the task's actions are outside of the robot's limits: {limit} and {limits}")
 
     # One episode, compiled.
     graph = CompiledGraph(nodes, AGENT, draw(nodes, _EPISODE_S))
     recorded = (SENSOR, AGENT, ACTUATOR)
 
     def episode(key: jax.Array) -> PyTree:
-        gs = graph.init(key, params=robot.simulation_params(values, None, 0))
+        gs = graph.init(key, params=simulation_params(robot, values, None, 0))
         return task.observe(graph.observe(gs)[1]), graph.rollout(gs, record=recorded)[1], _judged(task, gs)
 
     observation, records, judged = jax.jit(episode)(jax.random.key(0))
     _check_judgement(judged)
     _hold(observation.shape == (size,), f"an observation has shape {observation.shape}, not ({size},)")
-    _hold(task.observation_size == size, f"the task shows {task.observation_size} entries")
     _hold(bool(jnp.isfinite(observation).all()), f"an observation is not finite: {observation}")
     _include(nodes, set(jax.eval_shape(task.params, jax.random.key(0))), "nodes with parameters")
 
     # Fields, units and score of its messages.
     outputs = {name: _ran(records[name]) for name in recorded}
-    fields = {field for row in robot.sensor.joints.values() for field in row.values()}
     measured = as_columns(outputs[SENSOR])
-    # The column of a vector with one entry has no index.
-    _include(measured, {f if f in measured else f.removesuffix("[0]") for f in fields}, "fields of joints")
     _include(outputs[ACTUATOR], {robot.drive.command}, "fields of a command")
     _include(robot.units, {*outputs[SENSOR], robot.drive.command}, "units")
     command, actions = outputs[ACTUATOR][robot.drive.command], len(robot.agent.action)
@@ -125,7 +117,7 @@ def check_simulation(robot: Robot) -> None:
 def check_embedded(robot: Robot, folder: Path, limits: GateLimits) -> None:
     """Check that the embedded robot opens, takes torque, and ends without."""
     truth = folder / "truth.bin"
-    with robot.drive.connect("embedded", limits, truth, 0) as rig:
+    with connected(robot.drive, "embedded", limits, truth, 0) as rig:
         reading = rig.measure()
         _hold(bool(np.isfinite(reading.position_rad).all()), f"the embedded robot is at {reading.position_rad}")
         rig.start()

@@ -14,7 +14,7 @@ from sim2real.artifacts.run import sha256
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
 from sim2real.identification.export.card import differing, json_document, write_card
-from sim2real.identification.export.mjcf import Late, late_mjcf
+from sim2real.identification.export.mjcf import late_mjcf
 from sim2real.identification.export.targets import source_of
 from sim2real.identification.export.terms import find_delays, find_terms
 from sim2real.identification.model import IdentifiableModel
@@ -80,7 +80,7 @@ def write_export(
         note(f"verdict: {status}; the file contains the verdict, too")
     # Put the estimates into the robot's model; optional terms that were not identified are switched off.
     off, sides = {p.name: p.nominal for p in model.parameters}, {p.name: p.side for p in model.parameters}
-    text = robot.identified_mjcf({**off, **identification.values})
+    text = robot.simulated.identified_mjcf({**off, **identification.values})
     terms = None if text is None else find_terms(identification, lambda values: _text(robot, {**off, **values}), sides)
     # Write the format: JSON and a card need no model, the others need one.
     if to in ("json", "card"):
@@ -97,7 +97,7 @@ def write_export(
         note(f"not expressed in {to}: {', '.join(terms.unexpressed)}")
         about = [*about, ("not expressed", ", ".join(terms.unexpressed))]
     if to == "mjcf":
-        content = late_mjcf(text, terms, Late(robot.export_lead_s, robot.profile_rad_s), about)
+        content = late_mjcf(text, terms, robot.simulated.late, about)
     else:
         title = f"Actuators and randomisation of {identification.pipeline!r}, as sim2real identified them."
         content = source_of(to, terms, title, about)
@@ -123,7 +123,7 @@ def write_model_card(
     """
     if folder.is_file() or (folder.is_dir() and any(folder.iterdir()) and not (folder / "card.json").is_file()):
         raise UsageError(f"{folder} is there and holds no model card", hint="name another folder with --out")
-    plain = robot.plain_simulation({p.name: p.nominal for p in model.parameters} | identification.values)
+    plain = robot.simulated.plain_simulation({p.name: p.nominal for p in model.parameters} | identification.values)
     card, signals = write_card(
         folder, identification, model, plain, document, _session(identification, SENSOR, run_dir)
     )
@@ -171,7 +171,7 @@ def _of_motors(values: Json) -> str:
 
 
 def _text(robot: RecordedRobot, values: Mapping[str, float]) -> str:
-    text = robot.identified_mjcf(values)
+    text = robot.simulated.identified_mjcf(values)
     if text is None:
         raise UsageError(f"robot {type(robot).__name__} has a MuJoCo model for some values and none for others")
     return text

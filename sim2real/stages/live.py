@@ -18,7 +18,7 @@ from pathlib import Path
 
 from sim2real.artifacts.paths import shown
 from sim2real.errors import Sim2RealError
-from sim2real.robots.robot import RecordedRobot, Robot
+from sim2real.robots.robot import RecordedRobot, Robot, joint_columns
 from sim2real.stages.terminal.console import note
 from sim2real.types import Json
 from sim2real.view.live.follower import PERIOD_S, Follower
@@ -37,9 +37,9 @@ def scene_of(robot: RecordedRobot) -> dict[str, Json]:
     """Return what another process needs to draw a robot; empty if the robot has no model."""
     if not isinstance(robot, Robot):
         return {}
-    columns = {name: fields["position"] for name, fields in robot.sensor.joints.items() if "position" in fields}
+    columns = {name: fields["position"] for name, fields in joint_columns(robot.sensor.channels).items()}
     file = getattr(robot, "mjcf", None)  # of a walking robot, which has no model for others
-    return {"mjcf": robot.identified_mjcf(robot.nominal()) or (str(file) if file else None), "columns": columns}
+    return {"mjcf": robot.model.identified_mjcf(robot.nominal()) or (str(file) if file else None), "columns": columns}
 
 
 def drawn(scene: Mapping[str, Json]) -> Scene | None:

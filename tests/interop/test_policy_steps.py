@@ -10,6 +10,7 @@ import pytest
 from sim2real.errors import UsageError
 from sim2real.graph.schedule import draw
 from sim2real.interop.robot import RobotEnvironment
+from sim2real.robots.training import training_loop
 from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.stages.load import load_robot
 from sim2real.stages.train.bundle import contract_of
@@ -21,7 +22,7 @@ VALUES = {"sensor_delay": 0.02, "actuator_delay": 0.025}
 def robot_at(rate_hz, episode_s=0.5):
     """The pendulum, whose world ticks at 100 Hz, with a policy of another rate."""
     robot = load_robot("pendulum")
-    nodes, task = robot.training({**robot.nominal(), **VALUES}, {}, {}, True)
+    nodes, task = training_loop(robot, {**robot.nominal(), **VALUES}, {}, {}, True)
     for name in ("sensor", "agent", "actuator"):
         nodes[name].rate = rate_hz
     env = GraphEnvironment(CompiledGraph(nodes, "agent", draw(nodes, episode_s)), task)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from sim2real.identification.model import Channel
 from sim2real.robots import testing
 from sim2real.stages.load import load_robot
 
@@ -26,23 +27,16 @@ def pendulum(part=None, **changes):
     return robot
 
 
-def too_strong(robot, values, draws, computation, delays):
-    nodes, task = super(type(robot), robot).training(values, draws, computation, delays)
-    task.action_high = 2.0 * task.action_high
-    return nodes, task
-
-
 @pytest.mark.parametrize(
     ("part", "changes", "message"),
     [
         (None, {"units": {"action": "V"}}, "units: there are action, but not th, thdot"),
         (None, {"nominal": lambda _: {"gain": 1e9}}, "gain = 1000000000.0 is outside its bounds"),
         (None, {"nominal": lambda _: {"mass": 1.0}}, "parameters that can be identified: .* but not mass"),
-        (None, {"training": too_strong}, "are outside of the robot's limits"),
         (
             "sensor",
-            {"joints": property(lambda _: {"hinge": {"position": "angle"}})},
-            "fields of joints: there are th, thdot, but not angle",
+            {"channels": (Channel("angle", None, 0.002, 0.05),)},
+            "fields that the sensor measures: there are th, thdot, but not angle",
         ),
         ("task", {"score": lambda _, t_s, states: {"success": np.nan}}, "success is nan, not a share"),
         (

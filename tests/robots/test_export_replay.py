@@ -15,7 +15,7 @@ from sim2real.graph.base import Base
 from sim2real.graph.episode import Episode, Steps
 from sim2real.graph.node import BaseNode
 from sim2real.identification.config import FitConfig
-from sim2real.identification.export.mjcf import Late, late_mjcf
+from sim2real.identification.export.mjcf import late_mjcf
 from sim2real.identification.export.terms import find_terms
 from sim2real.identification.model import Channel
 from sim2real.identification.parameters import Parameter
@@ -169,7 +169,7 @@ def test_the_exported_file_alone_does_in_c_what_the_graph_predicts(terms):
     """Off by less than 1 % of the motion: commands, delays of both sides, friction that sticks."""
     robot = Hinge()
     ts, ours = predicted(robot, FOUND, "action", GOALS, ())
-    text = late_mjcf(robot.identified_mjcf(FOUND), terms, Late(robot.export_lead_s, robot.profile_rad_s), [])
+    text = late_mjcf(robot.identified_mjcf(FOUND), terms, robot.late, [])
     rows = played(text, "hinge", GOALS)
     assert np.ptp(ours) > 0.5
     off = lambda early_s: np.sqrt(np.mean((np.interp(ts - early_s, *rows) - ours) ** 2)) / np.std(ours)  # noqa: E731

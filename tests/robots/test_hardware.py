@@ -13,7 +13,8 @@ from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.safety.gate import GateLimits
 from sim2real.log.reader import read_log
 from sim2real.robots.messages import Goals
-from sim2real.robots.nodes import Excitation
+from sim2real.robots.nodes import Excitation, connected, deployment_nodes, recording_nodes
+from sim2real.robots.training import simulation_params
 from sim2real.stages.load import load_robot, moving
 from sim2real.stages.session.episode import Bench
 
@@ -60,14 +61,14 @@ def episodes(arm, tmp_path_factory):
     folder, robot = tmp_path_factory.mktemp("arm"), arm
     truth, logs = folder / "truth.bin", (folder / "recorded.mcap", folder / "deployed.mcap")
     policy = Steady([1.0, -0.5, 0.25])
-    with robot.drive.connect("embedded", GATE, truth, 3) as rig:
+    with connected(robot.drive, "embedded", GATE, truth, 3) as rig:
         range_ = rig.gate.config.range
         config = Config()
         robot.drive.prepare(rig, 5.0)
-        nodes = robot.recording_nodes(rig, SIGNAL)
+        nodes = recording_nodes(robot, rig, SIGNAL)
         recorded = Bench(robot, rig, config).run_episode(nodes, {}, logs[0], 1.0, "record")
         robot.drive.prepare(rig, 10.0)
-        nodes, params = robot.deployment_nodes(rig, policy, trial=2)
+        nodes, params = deployment_nodes(robot, rig, policy, trial=2)
         deployed = Bench(robot, rig, config).run_episode(nodes, params, logs[1], 0.6, "deploy")
         left = rig.wait_until_still(5.0).position_rad
         robot.drive.prepare(rig, 10.0)
@@ -155,7 +156,7 @@ def test_the_log_says_what_the_episode_was_about_and_the_simulations_trial_is_th
     aims = episodes.deployed.outputs["agent"]["aim"]
     expected = np.asarray(robot.task.aim.draw(2))
     np.testing.assert_allclose(aims, np.tile(expected, (len(aims), 1)), atol=1e-6)
-    simulated = robot.simulation_params(robot.nominal(), None, trial=2)
+    simulated = simulation_params(robot, robot.nominal(), None, trial=2)
     np.testing.assert_array_equal(simulated["agent"].aim, expected)
 
 
@@ -179,7 +180,7 @@ def test_an_arm_that_rests_somewhere_else_is_refused(arm, tmp_path, why):
     else:
         robot = changed(arm, rest=(0.0, 0.9, 0.0))
     with (
-        robot.drive.connect("embedded", replace(GATE, limit=1.3), tmp_path / "truth.bin", 0) as rig,
+        connected(robot.drive, "embedded", replace(GATE, limit=1.3), tmp_path / "truth.bin", 0) as rig,
         pytest.raises(
             SafetyStop, match=r"joint 'shoulder' rests at .* rad, not within 0\.4 rad of 0(\.9)? rad"
         ) as caught,
@@ -193,7 +194,7 @@ def test_an_arm_that_rests_somewhere_else_is_refused(arm, tmp_path, why):
 def test_a_robot_without_an_embedded_twin_has_no_such_port(pair, tmp_path):
     with (
         pytest.raises(UsageError, match="has no embedded twin") as caught,
-        pair.drive.connect("embedded", GATE, tmp_path / "truth.bin", 0),
+        connected(pair.drive, "embedded", GATE, tmp_path / "truth.bin", 0),
     ):
         pass
     assert "--port" in caught.value.hint
@@ -207,7 +208,7 @@ def test_no_command_leaps_where_a_recording_outlasts_its_excitation(name):
     rest = SimpleNamespace(position_rad=np.full(len(robot.agent.action), 0.1))
     rig = SimpleNamespace(measure=lambda: rest, wait_until_still=lambda *_: rest)
     signal = 0.5 + 0.1 * np.linspace(0.0, 1.0, 100)[:, None] * np.ones(len(robot.agent.action))
-    agent = robot.recording_nodes(rig, signal, standing=name == "go2")["agent"]
+    agent = recording_nodes(robot, rig, signal, standing=name == "go2")["agent"]
     played = np.array([getattr(agent.step(SimpleNamespace(seq=k))[1], robot.drive.command) for k in range(200)])
     assert np.abs(np.diff(played[98:], axis=0)).max() < 0.03
     np.testing.assert_array_equal(played[-50:], np.tile(played[-1], (50, 1)))

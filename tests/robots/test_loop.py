@@ -19,12 +19,12 @@ from sim2real.robots.loop import (
     delay_bounds,
     delay_of,
     delay_parameters,
-    draw_values,
     recorded_loop,
     simulated_loop,
     split_delay,
     split_drawn_delay,
 )
+from sim2real.robots.training import draw_values
 
 TICK_S, SPREAD_S, LEAD_S = 0.01, 0.002, 0.00125
 VALUES = {"gain": 2.0, "damping": 0.3, "friction": 0.1, "sensor_delay": 0.013, "actuator_delay": 0.001}

@@ -13,6 +13,7 @@ from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.joint import Joint
 from sim2real.hardware.safety.gate import GateLimits
 from sim2real.log.reader import read_log
+from sim2real.robots.nodes import connected, recording_nodes
 from sim2real.stages.config import RecordConfig
 from sim2real.stages.session.episode import Bench
 
@@ -38,9 +39,9 @@ def test_goals_and_limits_are_the_joints_on_the_bus_too(arm, tmp_path):
     joints = (Joint("pan", 0.5, -1, 1.5), Joint("shoulder", -0.2, 1, 2.0), Joint("elbow", 0.1, -1, 0.8))
     robot = type(robot)(replace(robot.drive.servos, joints=joints))
     goal = np.array([0.4, -0.3, 0.5])
-    with robot.drive.connect("embedded", PATIENT, tmp_path / "truth.bin", 0) as rig:
+    with connected(robot.drive, "embedded", PATIENT, tmp_path / "truth.bin", 0) as rig:
         robot.drive.prepare(rig, 5.0)
-        nodes = robot.recording_nodes(rig, np.tile(goal, (90, 1)))
+        nodes = recording_nodes(robot, rig, np.tile(goal, (90, 1)))
         Bench(robot, rig, RecordConfig()).run_episode(nodes, {}, tmp_path / "log.mcap", 1.6, "record")
     episode, truth = read_log(tmp_path / "log.mcap"), read_truth(tmp_path / "truth.bin")
     position = episode.outputs["sensor"]["position"]

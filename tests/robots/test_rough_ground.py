@@ -8,6 +8,7 @@ from pipelines.go2.robot import ROBOT
 from sim2real import composer
 from sim2real.errors import UsageError
 from sim2real.policy.bundle import load_bundle
+from sim2real.robots.training import training_loop
 from sim2real.robots.walking.body import Terrain
 from sim2real.robots.walking.twin import Twin, walk
 from sim2real.robots.walking.world import ROUGHNESS, Ground
@@ -72,7 +73,7 @@ def test_a_training_without_roughness_has_a_flat_floor():
     values = ROBOT.nominal()
     kinds = []
     for draws in ({}, {ROUGHNESS: np.linspace(0.02, 0.04, 3)}):
-        nodes, task = ROBOT.training(values, draws, {}, True)
+        nodes, task = training_loop(ROBOT, values, draws, {}, True)
         start = task.robot.model.params({**values, ROUGHNESS: 0.04}, task.robot.task.at_rest(0))
         kinds.append((int(nodes["world"].environment.model.geom("floor").type[0]), start.qpos[:3].tolist()))
     plane, field = int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD)
@@ -83,7 +84,7 @@ def test_a_training_without_roughness_has_a_flat_floor():
 @pytest.mark.parametrize("bumps_m", [[0.0, 0.2], [-0.01, 0.04]])
 def test_roughness_that_the_ground_does_not_have_is_refused(bumps_m):
     with pytest.raises(UsageError, match=r"roughness must lie in \[0, 0.08\] m, got "):
-        ROBOT.training(ROBOT.nominal(), {ROUGHNESS: np.array(bumps_m)}, {}, True)
+        training_loop(ROBOT, ROBOT.nominal(), {ROUGHNESS: np.array(bumps_m)}, {}, True)
 
 
 def test_ground_rougher_than_that_of_training_is_harder_for_the_shipped_policy():
@@ -95,7 +96,7 @@ def test_ground_rougher_than_that_of_training_is_harder_for_the_shipped_policy()
 
 def test_the_start_of_a_share_of_the_curriculum_has_slower_commands():
     start = ROBOT.task.at_rest(3)
-    np.testing.assert_allclose(ROBOT.task.narrowed(start, 0.25).aim, 0.25 * np.asarray(start.aim))
+    np.testing.assert_allclose(ROBOT.task.moved(start, 0.0, 0.0, 0.25).aim, 0.25 * np.asarray(start.aim))
 
 
 @pytest.mark.parametrize("numbers", [{"most_m": 0.0}, {"cell_m": 2.0}, {"length_m": -1.0}])

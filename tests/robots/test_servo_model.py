@@ -13,6 +13,7 @@ from sim2real.errors import UsageError
 from sim2real.hardware.joint import Joint
 from sim2real.identification.rollouts import choose_engine
 from sim2real.robots.messages import EpisodeStart
+from sim2real.robots.robot import watched
 from sim2real.robots.servo.model import ServoModel, servo_parameters
 from sim2real.stages.load import load_robot
 from sim2real.stages.shared.identification import with_wanted_terms
@@ -71,7 +72,7 @@ def test_friction_that_wears_off_lets_a_joint_move_faster():
 def test_parameters_are_in_the_graph_as_in_the_exported_model(name):
     robot = load_robot(name)
     values = robot.nominal() | {"payload": 0.1, "damping": 0.3, "goal_offset_elbow_flex": 0.02}
-    exported = mujoco.MjModel.from_xml_string(robot.identified_mjcf(values))
+    exported = mujoco.MjModel.from_xml_string(robot.model.identified_mjcf(values))
     for field, numbers in robot.model.fields(values).items():
         np.testing.assert_allclose(getattr(exported, field), numbers, rtol=1e-4, atol=1e-7, err_msg=field)
     own = robot.model.model
@@ -91,7 +92,7 @@ def test_a_gear_is_in_the_model_and_not_in_the_servos_parameters(pair):
     for name, power in powers.items():
         expected = np.asarray(plain[name]).T * gears**power
         np.testing.assert_allclose(np.asarray(geared[name]).T, expected, rtol=1e-6, err_msg=name)
-    np.testing.assert_allclose(robot.plain_simulation(robot.nominal()).numbers["profile_rad_s"], 2.0 / gears)
+    np.testing.assert_allclose(robot.model.plain_simulation(robot.nominal()).numbers["profile_rad_s"], 2.0 / gears)
 
 
 def test_inertia_makes_up_for_what_the_implicit_step_adds(pair):
@@ -124,9 +125,9 @@ def test_a_model_without_a_servos_joint_is_refused(tmp_path):
 
 def test_a_payload_is_identified_where_it_is_asked_for_and_always_watched():
     arm = load_robot("arm")
-    identified, watched = arm.identifiable(0.06).parameters, arm.watched(0.06).parameters
+    identified, changeable = arm.identifiable(0.06).parameters, watched(arm, 0.06).parameters
     free = {p.name for p in identified if p.free}
-    assert {p.name for p in watched if p.free} - free == {"payload"}
+    assert {p.name for p in changeable if p.free} - free == {"payload"}
     assert {p.name for p in with_wanted_terms(identified, "payload") if p.free} == free | {"payload"}
     assert {p.name for p in with_wanted_terms(identified, "none") if p.free} == free
 

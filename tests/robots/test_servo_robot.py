@@ -9,8 +9,10 @@ import pytest
 from small_robot import SERVOS, SHEET, VALUES, PairRobot
 
 from sim2real.robots.messages import EpisodeStart
+from sim2real.robots.nodes import recording_nodes
 from sim2real.robots.servo.servos import DataSheet
 from sim2real.robots.servo.task import ServoMoment
+from sim2real.robots.training import node_parameters, simulation_params
 
 
 def slouching():
@@ -51,7 +53,7 @@ def test_fast_goals_cost_a_hundredth_of_the_mean_square_of_their_share_of_the_la
 
 def test_parameters_land_in_the_nodes_that_need_them(pair):
     values = {**VALUES, "sensor_delay": 0.012, "actuator_delay": 0.02}
-    params = pair.node_parameters(values, EpisodeStart([0.1, 0.2], [1.0, 2.0], jnp.array([0.4])), policy="policy")
+    params = node_parameters(pair, values, EpisodeStart([0.1, 0.2], [1.0, 2.0], jnp.array([0.4])), policy="policy")
     world = params["world"]
     np.testing.assert_array_equal(world.qpos, np.float32([0.1, 0.2]))
     np.testing.assert_array_equal(world.qvel, [1.0, 2.0])
@@ -60,12 +62,12 @@ def test_parameters_land_in_the_nodes_that_need_them(pair):
     np.testing.assert_array_equal(agent.start, world.qpos)
     assert (agent.policy, float(agent.aim[0])) == ("policy", pytest.approx(0.4))
     for name in ("sensor", "actuator"):
-        assert pair.node_parameters(VALUES, EpisodeStart([0, 0], [0, 0], jnp.zeros(1)))[name].delay is None
+        assert node_parameters(pair, VALUES, EpisodeStart([0, 0], [0, 0], jnp.zeros(1)))[name].delay is None
 
 
 def test_a_simulation_starts_from_rest_and_each_trial_has_its_own_aim():
     robot = slouching()
-    params = [robot.simulation_params(robot.nominal(), None, trial) for trial in (0, 1, 1)]
+    params = [simulation_params(robot, robot.nominal(), None, trial) for trial in (0, 1, 1)]
     np.testing.assert_array_equal(params[0]["world"].qpos, np.float32([0.1, -0.2]))
     np.testing.assert_array_equal(params[0]["world"].qvel, [0.0, 0.0])
     aims = [float(p["agent"].aim[0]) for p in params]
@@ -76,16 +78,16 @@ def test_a_simulation_starts_from_rest_and_each_trial_has_its_own_aim():
 def test_a_simulation_starts_where_the_robot_rested_also_beyond_the_bounds_of_its_goals(pair):
     """A folded SO-101 lies on its stop: a start within the bounds of goals was 90 mrad away from it."""
     beyond = np.asarray(pair.drive.servos.high) + 0.09
-    params = pair.simulation_params(pair.nominal(), None, measured=beyond)
+    params = simulation_params(pair, pair.nominal(), None, measured=beyond)
     np.testing.assert_allclose(params["world"].qpos, beyond, rtol=1e-6)
     assert params["world"].qpos.dtype == np.float32
 
 
 def test_a_recording_begins_where_the_joints_are(pair):
     reading = SimpleNamespace(position_rad=np.array([1.0, -0.3]))
-    rig = SimpleNamespace(measure=lambda: reading)
+    rig = SimpleNamespace(wait_until_still=lambda *_: reading)
     signal = 0.2 * np.sin(np.arange(100))[:, None] * np.ones(2)
-    agent = pair.recording_nodes(rig, signal)["agent"]
+    agent = recording_nodes(pair, rig, signal)["agent"]
     played = np.array([agent.step(SimpleNamespace(seq=k))[1].goal for k in range(100)])
     np.testing.assert_allclose(played[0], reading.position_rad)
     off = np.abs(played - signal)
@@ -97,9 +99,9 @@ def test_a_recording_begins_where_the_joints_are(pair):
 def test_an_excitation_is_around_the_middle_and_waits_where_it_ends():
     robot = PairRobot(replace(SERVOS, middle=(0.3, -0.2)))
     reading = SimpleNamespace(position_rad=np.array([0.3, -0.2]))
-    rig = SimpleNamespace(measure=lambda: reading)
+    rig = SimpleNamespace(wait_until_still=lambda *_: reading)
     signal = 0.1 * np.sin(np.arange(40))[:, None] * np.ones(2)
-    agent = robot.recording_nodes(rig, signal)["agent"]
+    agent = recording_nodes(robot, rig, signal)["agent"]
     played = np.array([agent.step(SimpleNamespace(seq=k))[1].goal for k in range(60)])
     np.testing.assert_allclose(played[:40], signal + np.array([0.3, -0.2]))
     np.testing.assert_allclose(played[40:], np.tile(played[39], (20, 1)))

@@ -67,7 +67,7 @@ def test_the_identified_model_holds_its_joints_as_the_identification_did(model_f
 def test_an_exported_servo_robot_rests_where_friction_holds_it(name):
     """With a single iteration of the solver, as in training, its joints shiver and creep."""
     robot = load_robot(name)
-    model = mujoco.MjModel.from_xml_string(robot.identified_mjcf(robot.nominal()))
+    model = mujoco.MjModel.from_xml_string(robot.model.identified_mjcf(robot.nominal()))
     model.opt.gravity[:], model.dof_frictionloss[:] = 0.0, 0.2
 
     def fastest():

@@ -7,6 +7,7 @@ import pytest
 from small_robot import VALUES
 
 from sim2real.robots.messages import EpisodeStart
+from sim2real.robots.training import node_parameters, training_loop
 
 DELAYED = {**VALUES, "sensor_delay": 0.015, "actuator_delay": 0.012}
 DRAWS = {
@@ -21,7 +22,7 @@ SPEEDS = jnp.array([1.5, -1.0])
 @pytest.fixture(scope="module")
 def loop(pair):
     """The nodes of the loop with delays, and its task."""
-    return pair.training(DELAYED, DRAWS, {}, True)
+    return training_loop(pair, DELAYED, DRAWS, {}, True)
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +35,7 @@ def drawn(loop):
 def test_a_start_is_moved_with_its_goals_and_within_the_joints_limits(pair, drawn):
     one = jax.tree.map(lambda leaf: leaf[0], drawn)
     start = EpisodeStart(one["world"].qpos, one["world"].qvel, one["agent"].aim)
-    moved = pair.node_parameters(VALUES, pair.task.moved(start, jnp.array([0.1, 100.0]), SPEEDS))
+    moved = node_parameters(pair, VALUES, pair.task.moved(start, jnp.array([0.1, 100.0]), SPEEDS))
     expected = [one["world"].qpos[0] + 0.1, pair.drive.servos.high[1]]
     np.testing.assert_allclose(moved["world"].qpos, np.minimum(expected, pair.drive.servos.high), rtol=1e-6)
     np.testing.assert_array_equal(moved["agent"].start, moved["world"].qpos)

@@ -20,6 +20,7 @@ from sim2real.errors import OtherMotion, UsageError
 from sim2real.robots.walking import weighing
 from sim2real.stages.identify.inputs import with_load
 from sim2real.stages.load import load_robot
+from sim2real.stages.session.excitation import bent_legs
 from sim2real.training.environment.draws import draw_robots
 from sim2real.training.environment.variation import VariationConfig
 
@@ -177,7 +178,7 @@ def test_logs_that_are_not_of_a_robot_on_its_feet_are_refused(tmp_path, standing
 
 
 def test_the_legs_bend_slowly_towards_the_folded_ones():
-    goals = ROBOT.drive.standing(10.0) + ROBOT.drive.centre
+    goals = bent_legs(ROBOT.drive.crouch, 10.0, ROBOT.rate_hz) + ROBOT.drive.centre
     assert len(goals) == 500
     np.testing.assert_allclose(goals[0], ROBOT.stance, atol=1e-6)
     share = (goals - ROBOT.stance) / (np.asarray(ROBOT.motors.folded) - ROBOT.stance)

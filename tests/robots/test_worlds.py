@@ -10,6 +10,7 @@ import pytest
 from sim2real.errors import UsageError
 from sim2real.graph.node import BaseWorld
 from sim2real.robots.robot import RobotModel, checked, in_world
+from sim2real.robots.training import simulation_params, training_loop
 from sim2real.stages.load import load_robot
 
 PLUGIN = Path(__file__).parents[1] / "plugin"
@@ -72,21 +73,25 @@ def test_another_world_has_its_own_parameters_and_the_robot_the_rest(table):
 def test_a_policy_is_trained_by_the_robots_own_task_with_draws_of_the_worlds_parameters(table):
     oiled = in_world(table, "oiled")
     late = {"sensor_delay": np.array([0.004, 0.006]), "actuator_delay": np.array([0.011, 0.015])}
-    nodes, task = oiled.training(VALUES, {"drag": np.array([7.0, 7.5]), **late}, {}, True)
+    nodes, task = training_loop(oiled, VALUES, {"drag": np.array([7.0, 7.5]), **late}, {}, True)
     assert type(nodes["world"]).__name__ == "Oiled"
     params = [task.params(jax.random.key(i)) for i in range(8)]
     assert {float(p["world"].drag) for p in params} == {7.0, 7.5}
     assert {float(p["world"].loop) for p in params} == {20.0}
     trips = {round(float(p["sensor"].delay + p["actuator"].delay), 6) for p in params}
     assert trips == {0.015, 0.021}
-    at_rest = oiled.simulation_params(VALUES, None, trial=1)
+    at_rest = simulation_params(oiled, VALUES, None, trial=1)
     np.testing.assert_allclose(at_rest["agent"].aim, table.task.at_rest(1).aim)
 
 
 def test_the_curriculum_reaches_the_task_of_a_robot_in_another_world(table, monkeypatch):
     """It was dropped: commands came in full size from the first episode on."""
-    monkeypatch.setattr(type(table.task), "narrowed", lambda self, start, share: start.replace(aim=share * start.aim))
-    _, task = in_world(table, "oiled").training(VALUES, {}, {}, False)
+
+    def moved(self, start, position, velocity, share=1.0):
+        return start.replace(aim=share * start.aim)
+
+    monkeypatch.setattr(type(table.task), "moved", moved)
+    _, task = training_loop(in_world(table, "oiled"), VALUES, {}, {}, False)
     whole, half = (task.params(jax.random.key(0), jnp.float32(w))["agent"].aim for w in (1.0, 0.5))
     np.testing.assert_allclose(half, 0.5 * whole)
     assert float(jnp.abs(whole).max()) > 0

@@ -121,7 +121,7 @@ def test_without_jax_the_coverage_is_printed(monkeypatch, capsys):
     monkeypatch.setattr(check_stage, "has_jax", lambda: False)
     with pytest.raises(NotInstalled):
         check_stage.check("pendulum", LOG, {"json": True})
-    assert json.loads(capsys.readouterr().out)["recordings"][0]["joints"][0]["name"] == "th"
+    assert json.loads(capsys.readouterr().out)["recordings"][0]["joints"][0]["name"] == "hinge"
 
 
 def test_an_error_with_jax_is_not_reported_as_a_missing_package(monkeypatch):

@@ -14,9 +14,10 @@ from sim2real.artifacts.posterior import Posterior
 from sim2real.artifacts.sensitivity import Moved, Sensitivity
 from sim2real.errors import Sim2RealError
 from sim2real.graph.schedule import draw
+from sim2real.robots.training import training_loop
 from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.stages.load import load_robot
-from sim2real.stages.train.sensitivity import models_of, moves_of, sensitivity, with_room
+from sim2real.stages.train.sensitivity import fitted_to_graph, models_of, moves_of, room_s, sensitivity
 from sim2real.training.environment.graph_environment import GraphEnvironment
 from sim2real.training.networks.architectures import MLP
 from sim2real.training.networks.policy import Policy
@@ -72,13 +73,13 @@ def judged():
     found = found_with({**SURE, "gain": 0.02})
     moves = moves_of(found)
     models = models_of(found.values, moves)
-    robot = with_room(holding(), models)
-    nodes, task = robot.training(found.values, {}, {}, True)
+    robot, spread_s = holding(), room_s(models)
+    nodes, task = training_loop(robot, found.values, {}, {}, True, spread_s)
     env = GraphEnvironment(CompiledGraph(nodes, "agent", draw(nodes, 1.5)), task)
     layer = (jnp.zeros((robot.agent.observation_size, 1)), jnp.full(1, VOLTS / 2.0))
     zero, one = jnp.zeros(robot.agent.observation_size), jnp.ones(1)
     policy = Policy((layer,), one, zero, zero + 1.0, -2.0 * one, 2.0 * one, MLP((1,)))
-    return sensitivity(robot, env, policy, moves, models, seed=0)
+    return sensitivity(env, policy, moves, fitted_to_graph(models, robot.model.tick_s, spread_s), seed=0)
 
 
 @pytest.mark.night

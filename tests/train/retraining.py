@@ -13,6 +13,7 @@ import numpy as np
 from sim2real.artifacts.identification import Noise
 from sim2real.graph.delays import EmpiricalDist
 from sim2real.graph.schedule import draw
+from sim2real.robots.training import training_loop
 from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.stages.load import load_robot
 from sim2real.training.config import PPOConfig
@@ -29,7 +30,9 @@ def environment(recording: int) -> GraphEnvironment:
     draws = {n: v * (1 + 0.01 * rng.standard_normal(64)) for n, v in values.items() if "delay" not in n}
     draws["actuator_delay"] = values["actuator_delay"] + rng.uniform(-0.002, 0.002, 64)
     late = rng.gamma(4.0, 3e-4 + 2e-4 * recording, 500)
-    nodes, task = robot.training(values, draws, {n: EmpiricalDist(late) for n in ("sensor", "agent", "actuator")}, True)
+    nodes, task = training_loop(
+        robot, values, draws, {n: EmpiricalDist(late) for n in ("sensor", "agent", "actuator")}, True
+    )
     noise = 1e-3 * (1 + recording)
     nodes["sensor"].noise = (Noise("th", "rad", noise, 2 * noise, noise),)
     return GraphEnvironment(CompiledGraph(nodes, "agent", draw(nodes, 1.0, 4, recording), reusable=True), task)

@@ -8,6 +8,7 @@ import pytest
 from sim2real.errors import UsageError
 from sim2real.graph.schedule import draw
 from sim2real.robots.loop import AGENT
+from sim2real.robots.training import training_loop
 from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.stages.load import load_robot
 from sim2real.training.environment.graph_environment import GraphEnvironment
@@ -32,7 +33,7 @@ def robot():
 
 @pytest.fixture(scope="module")
 def env(robot):
-    nodes, task = robot.training(robot.nominal(), {}, {}, False)
+    nodes, task = training_loop(robot, robot.nominal(), {}, {}, False)
     return GraphEnvironment(CompiledGraph(nodes, AGENT, draw(nodes, 0.6)), task)
 
 

@@ -13,6 +13,7 @@ from sim2real.errors import UsageError
 from sim2real.graph.node import BaseNode
 from sim2real.graph.schedule import draw
 from sim2real.robots.loop import AGENT
+from sim2real.robots.training import training_loop
 from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.stages.load import load_robot
 from sim2real.stages.train.bundle import training_summary
@@ -39,7 +40,7 @@ def robot():
 def loop(robot):
     """The graph and the task of a pendulum whose gain differs, with a noisy sensor's parameters."""
     values = robot.nominal()
-    nodes, task = robot.training(values, {"gain": values["gain"] + np.array([-4.0, 4.0])}, {}, False)
+    nodes, task = training_loop(robot, values, {"gain": values["gain"] + np.array([-4.0, 4.0])}, {}, False)
     return nodes, task, CompiledGraph(nodes, AGENT, draw(nodes, 0.2))
 
 

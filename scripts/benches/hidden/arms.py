@@ -163,7 +163,7 @@ def play(arm: HiddenArm, robot: Any, act: Act, seconds: float, session: int) -> 
 def record(path: Path, arm: HiddenArm, robot: Any, seconds: float) -> None:
     """Write the log of the excitation of ``record``, played to an arm without a load."""
     from sim2real.robots.messages import Goals
-    from sim2real.robots.servo.servos import approached
+    from sim2real.robots.nodes import approached
     from sim2real.stages.session.excitation import excitation
 
     config = replace(robot.defaults.record, duration_s=seconds, seed=arm.seed)

@@ -35,9 +35,9 @@ def record(
     from sim2real.emulation.legs import EmulatedLegs, UnitreeEmulation
     from sim2real.emulation.robot import truth_header
     from sim2real.emulation.truth import TruthLog
-    from sim2real.robots.servo.servos import approached
+    from sim2real.robots.nodes import approached
     from sim2real.stages.load import load_module, load_robot
-    from sim2real.stages.session.excitation import excitation
+    from sim2real.stages.session.excitation import bent_legs, excitation
 
     pipeline = load_robot("go2")
     robot: Any = pipeline
@@ -49,7 +49,8 @@ def record(
     legs = EmulatedLegs(body, config, truth)
     # Let the legs hang, then plan the way to the excitation from there; or let the robot stand up.
     if standing:
-        begin_ns, goals = _stand_up(legs, robot), robot.drive.standing(seconds) + robot.drive.centre
+        goals = bent_legs(robot.drive.crouch, seconds, robot.rate_hz) + robot.drive.centre
+        begin_ns = _stand_up(legs, robot)
     else:
         begin_ns = round(1e9 * HANG_S)
         legs.advance(begin_ns)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import tomllib
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
@@ -17,6 +18,7 @@ from sim2real.artifacts.files import check
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.episode import Episode
 from sim2real.graph.node import BaseNode
+from sim2real.identification.export.mjcf import Late
 from sim2real.identification.model import Channel, PlainSimulation
 from sim2real.identification.parameters import Parameter, ParameterTable
 from sim2real.log.importing.mapping import toml_value
@@ -226,7 +228,9 @@ class MjcfRobot(LoggedRobot):
             *(() if "volts" in self.config.commands else ("voltage",)),
         }
         terms = (t for t in offered if t.free or t.what not in without)
-        return MjcfRobot(replace(self.config, terms=tuple(terms))).called_like(self)
+        robot = copy.copy(self)  # with its name and defaults
+        robot.__init__(replace(self.config, terms=tuple(terms)))
+        return robot
 
     def identifiable(self, max_delay_s: float) -> IdentifiableMjcf:
         return IdentifiableMjcf(self, max_delay_s)
@@ -245,12 +249,8 @@ class MjcfRobot(LoggedRobot):
         )
 
     @property
-    def export_lead_s(self) -> float:
-        """What C MuJoCo adds to the delay of commands [s].
-
-        Half a step for the integrator's sake, as ``DrivenWorld`` does in the graph.
-        """
-        return 0.5 * self.config.step_s
+    def late(self) -> Late:
+        return Late(0.5 * self.config.step_s)  # for the integrator's sake, as `DrivenWorld` does in the graph
 
     def identified_mjcf(self, values: Mapping[str, Scalar]) -> str | None:
         """Return the file's model with the identified values: friction, inertia, payload, tilt, and each joint's drive.

@@ -19,6 +19,7 @@ import numpy as np
 from sim2real.arrays import beside_damping
 from sim2real.errors import UsageError
 from sim2real.hardware.safety.following import RESPONSE_S, Following
+from sim2real.identification.export.mjcf import Late
 from sim2real.identification.export.plain import PlainSimulation, converged
 from sim2real.identification.parameters import Parameter
 from sim2real.later import jnp
@@ -100,10 +101,6 @@ class ServoModel(RobotModel):
     ) -> None:
         self.servos, self.mjcf, self.hand, self.causes = servos, mjcf, hand, causes
         self.step_s, self.tick_s, self.lead_s, self._dynamics = step_s, tick_s, 0.5 * step_s, dynamics
-        # MuJoCo adds half a step for its leapfrog, as in the graph, and half a step because it uses setpoints of a
-        # step's end. In the graph a goal acts as its mean over a tick, so a profile starts up to a tick early.
-        self.export_lead_s = step_s - 0.25 * tick_s
-        self.profile_rad_s = servos.sheet.profile_rad_s
         self.watched_terms = (PAYLOAD,) if hand else ()
 
     def dynamics(self) -> list[Parameter]:
@@ -162,6 +159,12 @@ class ServoModel(RobotModel):
         middle = (mass * centre + payload * np.asarray(self.hand.at_m)) / total
         masses, centres = (jnp.asarray(x, jnp.float32) for x in (model.body_mass, model.body_ipos))
         return numbers | {"body_mass": masses.at[link].set(total), "body_ipos": centres.at[link].set(middle)}
+
+    @property
+    def late(self) -> Late:
+        # MuJoCo adds half a step for its leapfrog, as in the graph, and half a step because it uses setpoints of a
+        # step's end. In the graph a goal acts as its mean over a tick, so a profile starts up to a tick early.
+        return Late(self.step_s - 0.25 * self.tick_s, self.servos.sheet.profile_rad_s)
 
     def identified_mjcf(self, values: Mapping[str, Scalar]) -> str:
         return converged(self._identified(values))

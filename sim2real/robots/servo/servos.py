@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +15,7 @@ from sim2real.hardware import dynamixel, feetech
 from sim2real.identification.model import Channel
 from sim2real.robots.loop import ACTUATOR
 from sim2real.robots.messages import Goals, JointReading
+from sim2real.robots.nodes import HOME_RAD_S
 from sim2real.robots.probe import Probe
 from sim2real.robots.robot import Embedded, RobotDrive, RobotSensor
 
@@ -151,10 +152,6 @@ class Servos:
         return np.asarray(self.rest or np.zeros(len(self.joints)), np.float64)
 
 
-_HOLD_S = 1.0
-"""How long an excitation's last goals are repeated [s]."""
-HOME_RAD_S = 1.0
-"""Speed of joints on the way to the rest pose."""
 _AT_HOME_RAD, _AT_END_S = 0.1, 0.5
 
 
@@ -184,7 +181,6 @@ class ServoDrive(RobotDrive):
 
     command, units, message = "goal", MappingProxyType({"goal": "rad"}), Goals
     expected_delay_s = (0.004, 0.003, 0.002)
-    zero_rad = math.pi  # position 0 of a plain joint is where the servo's encoder is at half a turn
 
     def __init__(
         self,
@@ -204,7 +200,8 @@ class ServoDrive(RobotDrive):
         return self.servos.mounting
 
     def embedded(self, hanging: bool = False) -> Embedded | None:
-        return self._embedded() if self._embedded else None
+        # Position 0 of a plain joint is where the servo's encoder is at half a turn.
+        return replace(robot, zero_rad=math.pi) if self._embedded and (robot := self._embedded()) else None
 
     def device(self, port: str, silence_s: float, embedded: bool) -> Device:
         from sim2real.hardware.registry import load_device
@@ -225,18 +222,6 @@ class ServoDrive(RobotDrive):
             SafetyStop: The robot rests at another position, or the gate stopped it.
         """
         bring_home(rig, self.servos, self.rate_hz, settle_s)
-
-    def approach(self, rig: Rig, commands: np.ndarray) -> np.ndarray:
-        return approached(commands, rig.measure().position_rad, self.rate_hz)
-
-
-def approached(goals: np.ndarray, position_rad: np.ndarray, rate_hz: float) -> np.ndarray:
-    """Return goals ``(N, joints)`` that begin at positions ``(joints,)`` and reach the given goals at 1 rad/s [rad]."""
-    # Repeat the last goals: joints that began farther away than the excitation lasts go on towards them.
-    goals = np.vstack([goals, np.repeat(goals[-1:], round(_HOLD_S * rate_hz), axis=0)])
-    offset = position_rad - goals[0]
-    covered = np.arange(len(goals))[:, None] * HOME_RAD_S / rate_hz
-    return goals + np.sign(offset) * np.maximum(np.abs(offset) - covered, 0.0)
 
 
 def bring_home(rig: Rig, servos: Servos, rate_hz: float, settle_s: float) -> None:

@@ -100,7 +100,8 @@ class AimTask(RobotTask):
         rest = self._servos.at_rest
         return EpisodeStart(rest, np.zeros_like(rest), self.aim.draw(trial))
 
-    def moved(self, start: EpisodeStart, position: Array, velocity: Array) -> EpisodeStart:
+    def moved(self, start: EpisodeStart, position: Array, velocity: Array, share: Scalar = 1.0) -> EpisodeStart:
+        del share  # targets are as easy near as far
         low, high = (jnp.asarray(bound) for bound in (self._servos.low, self._servos.high))
         position = jnp.clip(start.position + position, low, high)
         return start.replace(position=position, velocity=start.velocity + velocity)

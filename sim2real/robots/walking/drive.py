@@ -18,7 +18,6 @@ from sim2real.errors import SafetyStop, UsageError
 from sim2real.graph.base import Base
 from sim2real.identification.model import Channel
 from sim2real.robots.robot import Embedded, RobotDrive, RobotSensor
-from sim2real.robots.servo.servos import approached
 from sim2real.types import Array
 
 if TYPE_CHECKING:
@@ -104,10 +103,8 @@ def gravity_of(quaternion: Array) -> Array:
 Place = Literal["floor", "stand"]
 _STILL_RAD_S = 0.3
 """Speed below which a joint is at rest, above the noise of the motors' speeds [rad/s]."""
-_HANG_S = 20.0
-"""Longest time for legs in a stand to come to rest, without torque [s]."""
-_BENT, _BEND_HZ = 0.25, 0.3
-"""How far a standing robot bends its legs, as a share of the way to folded ones, and how often: slowly [Hz]."""
+_BENT = 0.25
+"""How far a standing robot bends its legs, as a share of the way to folded ones."""
 _LARGEST = {"dq": 1.0, "kp": 120.0, "kd": 8.0, "tau": 1.0}
 """Largest magnitude of each column but the target [rad/s, N m/rad, N m s/rad, N m]; kp and kd are at least 0."""
 
@@ -208,6 +205,7 @@ class WalkingDrive(RobotDrive):
     ) -> None:
         self._mjcf, self._joints, self.centre, self.rate_hz = mjcf, tuple(joints), np.asarray(stance), rate_hz
         self._motors, self._stand_up = motors, stand_up or StandUp()
+        self.crouch = _BENT * (np.asarray(motors.folded) - self.centre) if motors else np.zeros_like(self.centre)
         self.message: Callable[[Any], LegCommand] = partial(leg_command, kp=gains[0], kd=gains[1])
 
     def embedded(self, hanging: bool = False) -> Embedded | None:
@@ -228,16 +226,6 @@ class WalkingDrive(RobotDrive):
 
     def prepare(self, rig: Rig, settle_s: float) -> None:
         rig.wait_until_still(settle_s, _STILL_RAD_S)
-
-    def standing(self, duration_s: float) -> np.ndarray:
-        t_s = np.arange(0.0, duration_s, 1.0 / self.rate_hz)
-        bent = 0.5 * _BENT * (1.0 - np.cos(2.0 * np.pi * _BEND_HZ * t_s))
-        folded = self.centre if self._motors is None else np.asarray(self._motors.folded)
-        return bent[:, None] * (folded - self.centre)
-
-    def approach(self, rig: Rig, commands: np.ndarray) -> np.ndarray:
-        hanging = rig.wait_until_still(_HANG_S, _STILL_RAD_S)
-        return approached(commands, hanging.position_rad, self.rate_hz)
 
     def begin(self, rig: Rig) -> None:
         """Let the robot stand up.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
@@ -52,7 +53,7 @@ class ComposedRobot(Robot):
     scale: ClassVar[float] = 0.5
     history: ClassVar[int] = 2
     policy_hz: ClassVar[float] = 50.0
-    commands: ClassVar[Commands] = Commands()
+    commands: Commands = Commands()
     terrain: ClassVar[Terrain] = Terrain()
     gains: ClassVar[tuple[float, float]] = (35.0, 0.6)
     motors: ClassVar[LegMotors | None] = None
@@ -84,8 +85,10 @@ class ComposedRobot(Robot):
 
     def commanded(self, command: tuple[float, float, float]) -> ComposedRobot:
         """Return the robot with this command in all trials."""
-        kind = type(type(self).__name__, (type(self),), {"commands": replace(self.commands, fixed=command)})
-        return kind().called_like(self)
+        robot = copy.copy(self)  # with its name and defaults
+        robot.commands = replace(self.commands, fixed=command)
+        robot.__init__()
+        return robot
 
     def nominal(self) -> dict[str, float]:
         return super().nominal() | dict(zip(DELAYS, self.delays_s, strict=True))

@@ -181,8 +181,8 @@ class WalkingTask(RobotTask):
     def at_rest(self, trial: int) -> EpisodeStart:
         return EpisodeStart(self._stance, np.zeros_like(self._stance), self._commands.of_trial(trial))
 
-    def narrowed(self, start: EpisodeStart, share: Array) -> EpisodeStart:
-        return start.replace(aim=share * start.aim)
+    def moved(self, start: EpisodeStart, position: Array, velocity: Array, share: Scalar = 1.0) -> EpisodeStart:
+        return super().moved(start, position, velocity).replace(aim=share * start.aim)
 
     def judged(self, graph_state: GraphState) -> Moment:
         world, agent = graph_state.state[WORLD], graph_state.state[AGENT]

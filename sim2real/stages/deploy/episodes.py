@@ -18,8 +18,9 @@ from sim2real.log.writer import McapRecorder
 from sim2real.policy.contract import PolicyContract
 from sim2real.policy.runner import BlendedRunner, Runner, UprightRunner
 from sim2real.robots.loop import ACTUATOR, SENSOR
+from sim2real.robots.nodes import deployment_nodes
 from sim2real.robots.probe import Probe, StepAnswers, Witness, measure_delay
-from sim2real.robots.robot import Robot
+from sim2real.robots.robot import Robot, joint_columns
 from sim2real.stages.deploy.config import DeployConfig
 from sim2real.stages.live import live_view, scene_of
 from sim2real.stages.session.episode import Bench, opened
@@ -93,7 +94,7 @@ def _run_one(bench: Bench, policy: Runner, trial: int, log: Path) -> dict[str, J
     else:
         note(f"waiting for the robot to come to rest, then {length}")
         bench.robot.drive.prepare(bench.rig, config.settle_s)
-    nodes, params = bench.robot.deployment_nodes(bench.rig, policy, trial)
+    nodes, params = deployment_nodes(bench.robot, bench.rig, policy, trial)
     return bench.run_episode(nodes, params, log, config.duration_s, "deploy")
 
 
@@ -168,7 +169,7 @@ def _write_probe(log: Path, robot: Robot, witness: Witness) -> None:
     outputs = {SENSOR: robot.sensor.at_rest, ACTUATOR: robot.drive.message(np.zeros(len(robot.agent.action)))}
     graph = {n: {"rate_hz": robot.rate_hz, "delay_s": 0.0, "inputs": {}} for n in outputs}
     metadata = {"pipeline": robot.name, "dry_run": False, "graph": graph, "probe": True}
-    joints, units = {SENSOR: robot.sensor.joints}, dict.fromkeys(outputs, robot.units)
+    joints, units = {SENSOR: joint_columns(robot.sensor.channels)}, dict.fromkeys(outputs, robot.units)
     recorder = McapRecorder(log, metadata, {}, outputs, [], joints, units)
     recorder.start(0, start_ns)
     read, message = robot.sensor.read, robot.drive.message

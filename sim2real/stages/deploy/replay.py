@@ -19,7 +19,7 @@ from sim2real.identification.parameters import ParameterTable
 from sim2real.identification.predictions import NOISE, Position, positions
 from sim2real.identification.residuals import Problem
 from sim2real.identification.segments import Span
-from sim2real.robots.robot import RecordedRobot
+from sim2real.robots.robot import RecordedRobot, watched
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.shared.identification import identified_robot, side_by_side
 
@@ -46,7 +46,7 @@ def tested(
     problem, ahead_s = _problem(robot, identification, episodes, config)
     posterior = identification.needed_posterior()
     # Test each parameter, and fit all of them to this log.
-    drifted, x = drift_test.drift(problem, posterior, identification.widening or 1.0, robot.causes)
+    drifted, x = drift_test.drift(problem, posterior, identification.widening or 1.0, robot.simulated.causes)
     z = refine(problem, problem.table.within(x)[None], gain=problem.precision).x
     refitted = {n: float(np.ravel(v)[0]) for n, v in problem.table.decode(z).items()}
     nominal = {p.name: p.nominal for p in problem.model.parameters}
@@ -87,7 +87,7 @@ def _problem(
     Raises:
         Sim2RealError: When the logs are too short or of another motion.
     """
-    model = robot.watched(config.max_delay_s)
+    model = watched(robot, config.max_delay_s)
     if isinstance(model, ChecksLogs):
         for episode in episodes:
             model.check(episode)
@@ -110,8 +110,8 @@ def _problem(
 
     # Free the parameters that may have changed since.
     identified = {p.name for p in robot.identifiable(config.max_delay_s).parameters if p.free}
-    watched = {p.name for p in model.parameters if p.free} - identified
-    table = _table(model.parameters, identification, watched)
+    changeable = {p.name for p in model.parameters if p.free} - identified
+    table = _table(model.parameters, identification, changeable)
     return Problem(model, list(episodes), spans, length_s, config, table), ahead_s
 
 

@@ -23,6 +23,7 @@ from sim2real.later import jax
 from sim2real.log.session import input_ages
 from sim2real.robots.loop import ACTUATOR, AGENT, SENSOR, WORLD
 from sim2real.robots.robot import Robot, as_columns, as_sent
+from sim2real.robots.training import simulation_params, training_loop
 from sim2real.stages.terminal.console import note, progress
 from sim2real.stages.terminal.interruption import patiently
 from sim2real.types import PyTree
@@ -161,7 +162,7 @@ def simulate(
     if hiccups:
         counts = ", ".join(f"{count} of {name}" for name, count in hiccups.items())
         note(f"the simulation omits steps that took longer than a period of the policy: {counts}")
-    nodes, _ = robot.training(parameters[0], {}, computation, True)
+    nodes, _ = training_loop(robot, parameters[0], {}, computation, True)
     if isinstance(world := nodes[WORLD], ServoWorld):
         world.solve_to_rest()
     count = len(parameters)
@@ -172,7 +173,7 @@ def simulate(
     # Each simulation does the trial of its episode, from where the robot rested: friction holds it beside the task's
     # start, and a swing-up from there may go to the other side.
     episodes = [(e % len(rest), rest[e % len(rest)]) for e in range(count)]
-    trials = [robot.simulation_params(v, policy, *e) for v, e in zip(parameters, episodes, strict=True)]
+    trials = [simulation_params(robot, v, policy, *e) for v, e in zip(parameters, episodes, strict=True)]
     params = jax.tree_util.tree_map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *trials)
     recorded = tuple({scored_node, SENSOR, AGENT, ACTUATOR})
 

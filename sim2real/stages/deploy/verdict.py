@@ -19,7 +19,7 @@ from sim2real.artifacts.run import MANIFEST
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import OtherMotion, Sim2RealError
 from sim2real.installation import has_jax
-from sim2real.robots.robot import RecordedRobot, in_world
+from sim2real.robots.robot import RecordedRobot, in_world, watched
 from sim2real.stages.load import defaults_of
 from sim2real.stages.shared.identification import command
 from sim2real.stages.terminal.console import progress
@@ -290,9 +290,13 @@ def terms_to_identify(
     if configured in ("auto", "all"):
         return configured
     robot, max_delay_s = in_world(robot, identification.world), defaults_of(robot).identify.max_delay_s
-    watched, default = robot.watched(max_delay_s).parameters, robot.identifiable(max_delay_s).parameters.terms
+    default = robot.identifiable(max_delay_s).parameters.terms
     changed = (drift.named or drift.likely) if drift is not None else None
-    added = [p.term for p in watched if changed is not None and p.name == changed.name and p.term]
+    added = [
+        p.term
+        for p in watched(robot, max_delay_s).parameters
+        if changed is not None and p.name == changed.name and p.term
+    ]
     before = default if identification.terms is None else identification.terms
     terms = tuple(dict.fromkeys([*before, *added]))
     return configured if terms == default else ",".join(terms) or "none"

@@ -119,7 +119,7 @@ def _write(identification: Identification, stage: OpenStage, robot: RecordedRobo
     """Write the artifact, and the model as MJCF."""
     for name, path in identification.save(stage.folder).items():
         stage.output(name, path)
-    if (mjcf := robot.identified_mjcf(identification.values)) is not None:
+    if (mjcf := robot.simulated.identified_mjcf(identification.values)) is not None:
         stage.output("mjcf", "identified.xml").write_text(mjcf, encoding="utf-8")
 
 

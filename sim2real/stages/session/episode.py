@@ -24,7 +24,8 @@ from sim2real.installation import has_jax
 from sim2real.later import jax
 from sim2real.log.writer import McapRecorder
 from sim2real.robots.loop import ACTUATOR, AGENT, ROLES, SENSOR
-from sim2real.robots.robot import Robot
+from sim2real.robots.nodes import connected
+from sim2real.robots.robot import Robot, joint_columns
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import MonotonicClock, realtime
 from sim2real.runtime.failure import noted
@@ -93,7 +94,7 @@ def opened(robot: Robot, config: RecordConfig | DeployConfig, truth_path: Path) 
     if config.dry_run:
         note("dry run: torque stays off and no goal is sent; what would have been sent is logged")
     hanging = isinstance(config, RecordConfig) and not config.standing
-    with robot.drive.connect(config.port, config.gate, truth_path, config.seed, hanging) as rig, realtime():
+    with connected(robot.drive, config.port, config.gate, truth_path, config.seed, hanging) as rig, realtime():
         if config.dry_run:
             rig.withhold_torque()
         for line in rig.device.without_host() if config.port != "embedded" else ():
@@ -181,7 +182,10 @@ class Bench:
             "hardware": self.rig.device.facts(),
         }
         inputs = [(n, i) for n, node in graph.nodes.items() for i in node.inputs]
-        joints, units = {SENSOR: self.robot.sensor.joints}, dict.fromkeys(graph.nodes, self.robot.units)
+        joints, units = (
+            {SENSOR: joint_columns(self.robot.sensor.channels)},
+            dict.fromkeys(graph.nodes, self.robot.units),
+        )
         return McapRecorder(log, metadata, {}, state.aux["outputs"], inputs, joints, units)
 
     def _summary(self, graph: AsyncGraph, watch: Watch) -> dict[str, Any]:

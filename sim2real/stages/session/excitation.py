@@ -23,6 +23,8 @@ _ROUNDED = 1e-6
 """Excess over a limit that is a rounding error [the command's unit]."""
 _LEAST_S = 1.0
 """Shortest motion [s]."""
+_BEND_HZ = 0.3
+"""How often a standing robot bends its legs [Hz]."""
 
 
 def played(config: RecordConfig, robot: Robot, announce: bool = False) -> np.ndarray:
@@ -36,9 +38,9 @@ def played(config: RecordConfig, robot: Robot, announce: bool = False) -> np.nda
     """
     commands = len(robot.agent.action)
     if config.standing:
-        if (bent := robot.drive.standing(config.duration_s)) is None:
+        if robot.drive.crouch is None:
             raise UsageError("this robot does not stand on legs", hint="choose another --excitation")
-        return bent
+        return bent_legs(robot.drive.crouch, config.duration_s, robot.rate_hz)
     if config.motion is None:
         return excitation(config, robot.rate_hz, commands).reshape(-1, commands)
     # The names of the robot's commands: its joints, otherwise their numbers.
@@ -180,6 +182,12 @@ def excitation(config: RecordConfig, rate_hz: float, commands: int = 1) -> np.nd
     signals = np.stack([make(t, config.low_hz, config.high_hz, rng) for _ in range(commands)], axis=1)
     played = config.amplitude * np.clip(signals, -1.0, 1.0) * np.minimum(1.0, t / 0.5)[:, None]
     return played[:, 0] if commands == 1 else played
+
+
+def bent_legs(crouch: np.ndarray, duration_s: float, rate_hz: float) -> np.ndarray:
+    """Return the commands ``(N, commands)`` of a robot on its feet, which bends its legs slowly and stretches them."""
+    t = np.arange(0.0, duration_s, 1.0 / rate_hz)
+    return 0.5 * (1.0 - np.cos(2.0 * np.pi * _BEND_HZ * t))[:, None] * crouch
 
 
 def _multisine(t: np.ndarray, low_hz: float, high_hz: float, rng: np.random.Generator) -> np.ndarray:

@@ -13,6 +13,7 @@ from sim2real.artifacts.recording import LOG, TRUTH, Recording
 from sim2real.artifacts.run import StageFolder, open_stage
 from sim2real.installation import has_jax
 from sim2real.robots.loop import SENSOR
+from sim2real.robots.nodes import recording_nodes
 from sim2real.robots.robot import RecordedRobot, Robot
 from sim2real.stages.check.config import CheckConfig
 from sim2real.stages.live import live_view, scene_of
@@ -49,7 +50,7 @@ def record(robot: AnyRobot, folder: AnyPath, config: RecordConfig | Mapping[str,
         if signal is None:
             bench.rig.withhold_torque()
             note("torque is off: move the robot by hand", urgent=True)
-        nodes = robot.recording_nodes(bench.rig, signal, config.standing)
+        nodes = recording_nodes(robot, bench.rig, signal, config.standing)
         bench.run_episode(nodes, {}, log, duration_s, "record")
     return Recording.load(log, truth)
 

@@ -14,8 +14,9 @@ from sim2real.artifacts.sensitivity import Moved, Sensitivity
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import UsageError
 from sim2real.identification.rollouts import jitted
-from sim2real.robots.loop import DELAYS, LoopTask, split_delay
+from sim2real.robots.loop import DELAY_SPREAD_S, DELAYS, split_delay
 from sim2real.robots.robot import Robot
+from sim2real.robots.training import LoopTask
 from sim2real.stages.train.config import TrainConfig
 from sim2real.stages.train.setup import prepare
 from sim2real.training.config import PPOConfig
@@ -44,8 +45,9 @@ def policy_sensitivity(
         return None
     moves = moves_of(identification)
     models = models_of(identification.values, moves)
-    setup = prepare(with_room(robot, models), replace(config, timelines=TIMELINES), identification, timing)
-    return sensitivity(setup.robot, setup.env, policy, moves, models, config.seed)
+    spread_s = room_s(models)
+    setup = prepare(robot, replace(config, timelines=TIMELINES), identification, timing, spread_s=spread_s)
+    return sensitivity(setup.env, policy, moves, fitted_to_graph(models, robot.model.tick_s, spread_s), config.seed)
 
 
 @dataclass(frozen=True)
@@ -117,25 +119,19 @@ def _round_trip(values: Mapping[str, float]) -> float:
     return sum(values[name] for name in DELAYS)
 
 
-def with_room(robot: Robot, models: Sequence[Mapping[str, float]]) -> Robot:
-    """Return a robot whose graph has room for the delays of all models.
-
-    Args:
-        models: Parameters by name; the graph is built from the first model.
-    """
+def room_s(models: Sequence[Mapping[str, float]]) -> float:
+    """Return the largest deviation of a model's delay from that of the first model, for the room in a graph [s]."""
     if not set(DELAYS) <= set(models[0]):
-        return robot
-    wide = copy.copy(robot)
-    wide.delay_spread_s = max(robot.delay_spread_s, *(abs(_round_trip(m) - _round_trip(models[0])) for m in models))
-    return wide
+        return DELAY_SPREAD_S
+    return max(DELAY_SPREAD_S, *(abs(_round_trip(m) - _round_trip(models[0])) for m in models))
 
 
-def _for_one_graph(robot: Robot, models: Sequence[Mapping[str, float]]) -> list[dict[str, float]]:
+def fitted_to_graph(models: Sequence[Mapping[str, float]], tick_s: float, spread_s: float) -> list[dict[str, float]]:
     """Return the models with the actuator's delay of the first; the sensor's delay takes the whole difference.
 
     Only the sum of both delays affects a policy's observations of its commands; see ``split_delay``.
     """
-    base = split_delay(models[0], robot.model.tick_s, robot.delay_spread_s)
+    base = split_delay(models[0], tick_s, spread_s)
     if not set(DELAYS) <= set(base):
         return [dict(m) for m in models]
     sensor, actuator = DELAYS
@@ -144,7 +140,6 @@ def _for_one_graph(robot: Robot, models: Sequence[Mapping[str, float]]) -> list[
 
 
 def sensitivity(
-    robot: Robot,
     env: GraphEnvironment,
     policy: Policy,
     moves: Sequence[Move],
@@ -154,10 +149,9 @@ def sensitivity(
     """Play a policy on every model, all in one program.
 
     Args:
-        env: With room for all models, see ``with_room``.
+        env: With room for the delays of all models.
     """
-    parameters = _for_one_graph(robot, models)
-    columns = {name: jnp.asarray([m[name] for m in parameters], jnp.float32) for name in parameters[0]}
+    columns = {name: jnp.asarray([m[name] for m in models], jnp.float32) for name in models[0]}
 
     # One episode for each copy; a rollout is as long as an episode.
     rows = env.length + 1

@@ -14,9 +14,10 @@ from sim2real.artifacts.identification import ROUND_TRIP, Identification, Noise
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.node import TICKS_PER_S, BaseNode
-from sim2real.robots.loop import AGENT, DELAYS, SENSOR, WORLD, LoopTask
+from sim2real.robots.loop import AGENT, DELAY_SPREAD_S, DELAYS, SENSOR, WORLD
 from sim2real.robots.nodes import SimSensor
 from sim2real.robots.robot import RecordedRobot, Robot
+from sim2real.robots.training import LoopTask, training_loop
 from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.stages.load import defaults_of, moving
 from sim2real.stages.shared.arguments import check_parameters
@@ -56,12 +57,14 @@ def prepare(
     identification: Identification | None = None,
     timing: Timing | None = None,
     changed: Mapping[str, float] | None = None,
+    spread_s: float = DELAY_SPREAD_S,
 ) -> TrainingSetup:
     """Make the environment.
 
     Args:
         timing: The robot's timing; default: that of the identification's recording. The nominal model has no delays.
         changed: Parameters with other values than the model's; the nominal model has delays if both are among them.
+        spread_s: Largest deviation of an episode's delay, for which the graph has room [s].
 
     Raises:
         Sim2RealError: The identification is of another robot or was not accepted, or its timing is unusable.
@@ -88,7 +91,7 @@ def prepare(
         timing = timing or timing_of(identification)
         recorded = RecordedTiming.of(timing, robot.rate_hz, config.seed, config.vary.pauses)
     delayed = recorded is not None or set(DELAYS) <= set(values)
-    nodes, task = robot.training(values, draws, recorded.computation if recorded else {}, delayed)
+    nodes, task = training_loop(robot, values, draws, recorded.computation if recorded else {}, delayed, spread_s)
     if recorded:
         recorded.set_transport(nodes)
     noise = _set_noise(nodes[SENSOR], identification, config)

@@ -1,0 +1,263 @@
+"""A robot's loop in simulation: the model to identify, the graph and the task of a training, an episode at rest."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any, Unpack
+
+import numpy as np
+
+from sim2real import pytree
+from sim2real.graph.base import GraphState, StepState
+from sim2real.graph.delays import DelayDistribution
+from sim2real.graph.episode import Episode, named_leaves
+from sim2real.graph.node import BaseNode, NodeOptions
+from sim2real.identification.parameters import ParameterTable
+from sim2real.later import jax, jnp
+from sim2real.robots.loop import (
+    ACTUATOR,
+    AGENT,
+    DELAY_SPREAD_S,
+    DELAYS,
+    SENSOR,
+    WORLD,
+    DelayParams,
+    delay_bounds,
+    delay_parameters,
+    recorded_loop,
+    simulated_loop,
+    split_delay,
+    split_drawn_delay,
+)
+from sim2real.robots.messages import EpisodeStart
+from sim2real.robots.nodes import SimActuator, SimSensor
+from sim2real.training.environment.tasks import Rewards, TrainingTask
+from sim2real.types import Array, PyTree, Scalar
+
+if TYPE_CHECKING:
+    from sim2real.robots.robot import Robot
+
+
+# -- the parts of the graph
+
+
+def node_parameters(
+    robot: Robot, values: Mapping[str, Scalar], start: EpisodeStart, policy: PyTree = None
+) -> dict[str, PyTree]:
+    """Return the parameters of all nodes in simulation, from values by name and a start."""
+    return {
+        WORLD: robot.model.params(values, start),
+        SENSOR: DelayParams(delay=values.get(DELAYS[0])),
+        ACTUATOR: DelayParams(delay=values.get(DELAYS[1])),
+        AGENT: robot.agent.params(start, policy),
+    }
+
+
+def _sim_actuator(robot: Robot, **options: Unpack[NodeOptions]) -> SimActuator:
+    drive = robot.drive
+    return SimActuator(ACTUATOR, drive.rate_hz, len(robot.agent.action), drive.command, drive.message, **options)
+
+
+def _lead_s(world: BaseNode) -> float:
+    """Return the time that a world adds to the actuator's delay [s]; see ``ServoWorld``."""
+    return getattr(world, "lead_s", 0.0)
+
+
+# -- training, and an episode beside one on the robot
+
+
+def training_loop(
+    robot: Robot,
+    values: Mapping[str, float],
+    draws: Mapping[str, np.ndarray],
+    computation: Mapping[str, DelayDistribution],
+    delays: bool,
+    spread_s: float = DELAY_SPREAD_S,
+) -> tuple[dict[str, BaseNode], LoopTask]:
+    """Return the graph of a robot in simulation, and the training task.
+
+    Args:
+        draws: Samples of some parameters, each of shape ``(K,)``; an episode uses one of the K joint samples in
+            place of the values.
+        computation: Node -> distribution of its computation delay.
+        delays: Whether the connections have delays.
+        spread_s: Largest deviation of an episode's delay from that of the values, for which there is room [s].
+    """
+    robot = copy.copy(robot)
+    robot.model = robot.model.for_training(values, draws)
+    drive, tick_s, world = robot.drive, robot.model.tick_s, robot.model.make_world()
+    # Share the delays between sensor and actuator as a simulated loop needs, and make room for all draws.
+    draws = split_drawn_delay(values, draws, tick_s, spread_s)
+    values = split_delay(values, tick_s, spread_s)
+    bounds = delay_bounds(values, tick_s, spread_s, _lead_s(world), draws) if delays else None
+    on_sensor, on_agent, on_actuator = (
+        {"delay": delay_s if delays else 0.0, "delay_dist": computation.get(name)}
+        for name, delay_s in zip((SENSOR, AGENT, ACTUATOR), drive.expected_delay_s, strict=True)
+    )
+    agent, sensor = robot.agent.make(drive.rate_hz, **on_agent), SimSensor(SENSOR, drive.rate_hz, world, **on_sensor)
+    sensor.noise = robot.sensor.noise
+    nodes = simulated_loop(sensor, agent, _sim_actuator(robot, **on_actuator), world, bounds)
+    return nodes, LoopTask(robot, agent, values, draws)
+
+
+def simulation_params(
+    robot: Robot, values: Mapping[str, float], policy: PyTree, trial: int = 0, measured: np.ndarray | None = None
+) -> dict[str, PyTree]:
+    """Return the nodes' parameters for an episode in simulation that starts at rest.
+
+    Args:
+        measured: Positions ``(channels,)`` where the robot rested, which may differ from the task's by friction.
+    """
+    values, start = split_delay(values, robot.model.tick_s), robot.task.at_rest(trial)
+    if measured is not None:
+        offset = measured - np.asarray(start.position)
+        angles = [robot.sensor.units.get(channel.position) == "rad" for channel in robot.sensor.channels]
+        # Whole turns of a hinge without range are no offset.
+        offset -= np.where(angles, 2 * np.pi * np.round(offset / (2 * np.pi)), 0.0)
+        # Not `moved`, which keeps drawn starts within the bounds of goals: a robot may rest beyond them, on a stop.
+        start = start.replace(position=start.position + offset)
+    return node_parameters(robot, values, start, policy)
+
+
+class LoopTask(TrainingTask):
+    """The training task of a robot in a loop.
+
+    Args:
+        draws: Samples of some parameters, each of shape ``(K,)``; one of the K joint samples is drawn for each episode
+            in place of the values.
+
+    Attributes:
+        start: Largest change of a joint's position [rad] and of its velocity [rad/s] at the start of an episode.
+    """
+
+    supervisor = AGENT
+    has_curriculum = True
+
+    def __init__(self, robot: Robot, agent: Any, values: Mapping[str, float], draws: Mapping[str, np.ndarray]) -> None:
+        self.robot, self.agent = robot, agent
+        self.values: dict[str, PyTree] = dict(values)
+        self.draws = {n: jnp.asarray(d, jnp.float32) for n, d in draws.items()}
+        self.observation_size = robot.agent.observation_size
+        self.start = (0.0, 0.0)
+        self.action_low, self.action_high = np.array([(t.low, t.high) for t in robot.agent.action], np.float32).T
+
+    @property
+    def data(self) -> PyTree:
+        """The values and samples of the parameters; see ``HoldsData``."""
+        return {n: jnp.asarray(v, jnp.float32) for n, v in self.values.items()}, self.draws
+
+    def with_data(self, data: PyTree) -> LoopTask:
+        """Return a copy with other values and samples, which may be traced."""
+        task = copy.copy(self)
+        task.values, task.draws = data
+        return task
+
+    def params(self, key: jax.Array, width: jax.Array | None = None) -> dict[str, PyTree]:
+        draw, task, offsets = partial(self._draw, width=width), self.robot.task, None
+        # Draw values and start; then move the start, and scale difficulty and noise.
+        if any(self.start):
+            key, key_start = jax.random.split(key)
+            offsets = self.offsets(key_start, width)
+        values, start = task.random(key, draw)
+        if offsets is not None or width is not None:
+            still = jnp.zeros(len(self.robot.sensor.channels))
+            start = task.moved(start, *(offsets or (still, still)), 1.0 if width is None else width)
+        params = node_parameters(self.robot, values, start)
+        return params if width is None else {**params, SENSOR: params[SENSOR].replace(noise=width)}
+
+    def offsets(self, key: jax.Array, width: jax.Array | None) -> tuple[jax.Array, jax.Array]:
+        """Draw the offsets of an episode's start: positions [rad] and velocities [rad/s], ``(joints,)`` each.
+
+        Args:
+            width: Share of the differences; None: all of them.
+        """
+        share = 1.0 if width is None else width
+        drawn = share * jax.random.uniform(key, (2, len(self.robot.sensor.channels)), minval=-1.0, maxval=1.0)
+        return self.start[0] * drawn[0], self.start[1] * drawn[1]
+
+    def observe(self, step_state: StepState) -> jax.Array:
+        return self.agent.observe(step_state)
+
+    def act(self, step_state: StepState, action: jax.Array) -> tuple[StepState, PyTree]:
+        return self.agent.act(step_state, action)
+
+    def reward(self, graph_state: GraphState, action: jax.Array) -> Rewards:
+        return self.robot.task.reward(self.robot.task.judged(graph_state), action)
+
+    def success(self, graph_state: GraphState) -> jax.Array:
+        return self.robot.task.success(self.robot.task.judged(graph_state))
+
+    def terminated(self, graph_state: GraphState) -> jax.Array:
+        return self.robot.task.terminated(self.robot.task.judged(graph_state))
+
+    def privileged(self, graph_state: GraphState) -> jax.Array:
+        state = self.robot.model.true_state(graph_state.state[WORLD])
+        numbers = [x for x in map(jnp.asarray, jax.tree.leaves((state, graph_state.params)))]
+        numbers = [x for x in numbers if jnp.issubdtype(x.dtype, jnp.inexact)]
+        return jnp.concatenate([x.astype(jnp.float32).ravel() for x in numbers])
+
+    def _draw(self, key: jax.Array, width: jax.Array | None) -> dict[str, PyTree]:
+        drawn = draw_values(key, self.values, self.draws)
+        if width is None:
+            return drawn
+        return {n: value + width * (drawn[n] - value) if n in self.draws else value for n, value in self.values.items()}
+
+
+def draw_values(key: jax.Array, values: Mapping[str, float], draws: Mapping[str, jax.Array]) -> dict[str, PyTree]:
+    """Draw the parameters of one episode.
+
+    Args:
+        draws: Samples of some parameters, each of shape ``(K,)``; one of the K joint samples is drawn in place of the
+            values.
+
+    Returns:
+        Parameters by name.
+    """
+    count = min((len(d) for d in draws.values()), default=1)
+    row = jax.random.randint(key, (), 0, count)
+    return {name: draws[name][row] if name in draws else value for name, value in values.items()}
+
+
+# -- identification
+
+
+class IdentifiableLoop:
+    """Simulates the sensor's measurements from recorded commands; an ``identification.model.IdentifiableModel``.
+
+    Args:
+        max_delay_s: Upper bound of each of the two delays [s].
+    """
+
+    sensor = SENSOR
+
+    def __init__(self, robot: Robot, max_delay_s: float) -> None:
+        self._robot = robot
+        self.parameters = ParameterTable([*robot.model.dynamics(), *delay_parameters(max_delay_s)])
+        self.ahead_s, self.channels = robot.model.tick_s, robot.sensor.channels
+        message = _sim_actuator(robot).init_output()
+        fields = pytree.structure(message).unflatten(list(named_leaves(message)))
+        self.given: Mapping[str, PyTree] = {ACTUATOR: fields}
+        self._aim = np.zeros_like(robot.task.at_rest(0).aim)
+
+    def nodes(self, max_delay_s: float) -> dict[str, BaseNode]:
+        """Return sensor, actuator and world, connected with delays of up to ``max_delay_s`` [s]."""
+        robot, world = self._robot, self._robot.model.make_world(resumed=True)
+        sensor = SimSensor(SENSOR, robot.rate_hz, world)
+        return recorded_loop(sensor, _sim_actuator(robot), world, max_delay_s, self.ahead_s, _lead_s(world))
+
+    def reached(self, recordings: Sequence[Episode]) -> Mapping[str, float]:
+        """Return an empty dict: there are no limits among the optional terms."""
+        return {}
+
+    def params(self, values: Mapping[str, Scalar], start: Array) -> dict[str, PyTree]:
+        """Return the nodes' parameters.
+
+        Args:
+            start: Shape ``(2 * channels,)``: initial positions, then velocities.
+        """
+        position, velocity = jnp.split(jnp.asarray(start), 2, axis=-1)
+        params = node_parameters(self._robot, values, EpisodeStart(position, velocity, self._aim))
+        del params[AGENT]
+        return {**params, SENSOR: DelayParams(values[DELAYS[0]] + self.ahead_s)}
