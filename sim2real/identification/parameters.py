@@ -109,7 +109,13 @@ class Parameter:
 
 
 class ParameterTable:
-    """Parameters in a fixed order, and the map from points of the free ones, each on its own scale, to values."""
+    """Parameters in a fixed order, and the map from points of the free ones, each on its own scale, to values.
+
+    Attributes:
+        columns: The free parameters.
+        low: Shape ``(P,)``: lower bounds on their scales.
+        span: Shape ``(P,)``: width of the bounds.
+    """
 
     def __init__(self, parameters: Iterable[Parameter]) -> None:
         self.parameters = tuple(parameters)
@@ -118,8 +124,9 @@ class ParameterTable:
             raise UsageError(f"parameter names must differ: {', '.join(names)}")
         self.columns = tuple(p for p in self.parameters if p.free)
         self.names = tuple(p.name for p in self.columns)
-        self._low = np.array([c.to_scale(c.low) for c in self.columns])
-        self._high = np.array([c.to_scale(c.high) for c in self.columns])
+        self.low = np.array([c.to_scale(c.low) for c in self.columns])
+        self.high = np.array([c.to_scale(c.high) for c in self.columns])
+        self.span = self.high - self.low
 
     def __len__(self) -> int:
         return len(self.columns)
@@ -256,7 +263,7 @@ class ParameterTable:
 
     def within(self, x: np.ndarray) -> np.ndarray:
         """Return points on the parameters' scales ``(..., P)``, clipped to the bounds."""
-        return np.clip(x, self._low, self._high)
+        return np.clip(x, self.low, self.high)
 
     def posterior(self, x: np.ndarray, covariance: np.ndarray) -> Posterior:
         """Return the distribution from which training draws.
@@ -306,18 +313,3 @@ class ParameterTable:
         """Return d value / d scale at points on the parameters' scales, ``(P,)``."""
         values = self.unscale(x)
         return np.array([TRANSFORMS[c.transform][2](v) for c, v in zip(self.columns, values, strict=True)])
-
-    @property
-    def low(self) -> np.ndarray:
-        """Lower bounds on the parameters' scales, ``(P,)``."""
-        return self._low
-
-    @property
-    def high(self) -> np.ndarray:
-        """Upper bounds on the parameters' scales, ``(P,)``."""
-        return self._high
-
-    @property
-    def span(self) -> np.ndarray:
-        """Width of the bounds on the parameters' scales, ``(P,)``."""
-        return self._high - self._low

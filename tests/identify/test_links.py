@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 from sim2real.artifacts.identification import Identification, Judgement, Link, Ranged
 from sim2real.errors import UsageError
 from sim2real.identification.delays import DelayEvidence, _losses, find, links, lost_share, measured
-from sim2real.stages.identify.show import show
+from sim2real.stages.identify.stage import show
 
 GAIN, RATE = 5.0, 8.0  # speed [rad/s] of a volt in the end, and how fast it gets there [1/s]
 COMMAND_DELAY_S, NOISE_RAD, COUNT_RAD = 0.004, 1e-3, 1e-3

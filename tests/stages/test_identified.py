@@ -3,7 +3,7 @@
 import pytest
 
 from sim2real.artifacts.identification import Estimate, Identification, Judgement
-from sim2real.stages.identify.show import show
+from sim2real.stages.identify.stage import show
 
 
 @pytest.mark.parametrize(
