@@ -480,16 +480,6 @@ class _Descent:
             self._on_step(*self._best)
 
 
-def with_terms(table: ParameterTable, x: np.ndarray, present: np.ndarray) -> np.ndarray:
-    """Return a point with the parameters of absent terms at their values without effect, ``(P,)``.
-
-    Args:
-        present: Shape ``(T,)``, bool: which of the table's terms.
-    """
-    off = [p.to_scale(min(max(p.without, p.low), p.high)) for p in (c for c in table.columns)]
-    return np.where(table.of_terms(present), x, off)
-
-
 def _refine(problem: Problem, starts: np.ndarray, report: OnProgress | None) -> Refined:
     """Descend from starts to the minimum, with reports."""
     left, share = 1.0, 0.5 / (problem.config.refine_steps * (1 + len(starts)))

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from sim2real.errors import UsageError
-from sim2real.identification.fit import Fit, bounded_step, refine, with_terms
+from sim2real.identification.fit import Fit, bounded_step, refine
 from sim2real.identification.parameters import ParameterTable
 from sim2real.identification.predictions import labels
 from sim2real.identification.residuals import Linearised, Problem
@@ -36,7 +36,6 @@ class HeldOutPart:
     """A fit without one part of the recordings, and its errors on that part.
 
     Attributes:
-        terms: Optional terms of the model in this fit.
         values: Parameter -> estimate of this fit.
         share: Parameter -> share of the information in all recordings that the part holds.
         ahead: Field -> root mean square error on the part up to the longest horizon; None without data.
@@ -45,7 +44,6 @@ class HeldOutPart:
     """
 
     name: str
-    terms: tuple[str, ...]
     values: Mapping[str, Any]
     share: Mapping[str, float]
     ahead: Mapping[str, float | None]
@@ -159,7 +157,7 @@ class Statistics:
         """
         # Move the parameters of absent terms to their values without effect.
         gone = ~table.of_terms(present)
-        moved = np.where(gone, with_terms(table, self.x, present) - self.x, 0.0)
+        moved = np.where(gone, table.without_terms(self.x, present) - self.x, 0.0)
         # Sum the quadratic functions of the parts.
         g, H = self.gradient.sum(axis=0), self.information.sum(axis=0) + self.prior
         if held_out is not None:
@@ -248,10 +246,8 @@ def predicted(
         ends: Shape ``(G, P)``: the estimates without each group.
     """
     problem, table, of = estimate.problem, estimate.problem.table, shared(parts)[1]
-    columns = table.of_terms(present)
-    by_group = [table.decode(x, columns) for x in ends]
+    by_group = [table.decode(x, table.of_terms(present)) for x in ends]
     values = [by_group[g] for g in of]
-    names = [tuple(n for n, there in zip(table.terms, present, strict=True) if there)] * len(parts)
     stacked = {n: np.stack([v[n] for v in values]) for n in values[0]}
     # The information of a group is that of its parts, in like shares.
     own = np.einsum("kpp->kp", stats.information) / np.bincount(of)[:, None]
@@ -261,7 +257,7 @@ def predicted(
     free, run_s = [{} for _ in parts], 0.0
     if free_run_s:
         free, run_s = _free(problem, parts, stacked, settle_s, free_run_s)
-    rows = zip(parts, names, values, shares, ahead, free, strict=True)
+    rows = zip(parts, values, shares, ahead, free, strict=True)
     return [HeldOutPart(part.name, *row, run_s=run_s) for part, *row in rows]
 
 

@@ -230,6 +230,15 @@ class ParameterTable:
         chosen = dict(zip(self.terms, present, strict=True)) | {"": True}
         return np.array([chosen[c.term] for c in self.columns], bool)
 
+    def without_terms(self, x: np.ndarray, present: np.ndarray) -> np.ndarray:
+        """Return a point with the parameters of absent terms at their values without effect, ``(P,)``.
+
+        Args:
+            present: Shape ``(T,)``, bool: which of ``terms``.
+        """
+        off = [c.to_scale(min(max(c.without, c.low), c.high)) for c in self.columns]
+        return np.where(self.of_terms(present), x, off)
+
     def of_limits(self) -> np.ndarray:
         """Return which of ``terms`` are limits, ``(T,)``, bool."""
         return np.array([any(p.limits for p in self if p.term == name) for name in self.terms], bool)

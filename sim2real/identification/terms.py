@@ -14,7 +14,7 @@ import numpy as np
 
 from sim2real.artifacts.identification import Outcome, TriedTerm
 from sim2real.identification import held_out
-from sim2real.identification.fit import ROUGH, Fit, refine, with_terms
+from sim2real.identification.fit import ROUGH, Fit, refine
 from sim2real.identification.held_out import Fold, HeldOutPart, Statistics, on_held_out_parts, statistics
 from sim2real.identification.parameters import ParameterTable
 from sim2real.identification.predictions import labels
@@ -217,7 +217,7 @@ class TermSearch:
         problem, table = self._problem, self._problem.table
         part, names = problem.part(present=table.of_terms(present)), self._names(present)
         self._on_set(", ".join(names) or "no term")
-        starts = [with_terms(table, x, present) for x in starts]
+        starts = [table.without_terms(x, present) for x in starts]
         order = np.argsort(np.nan_to_num([problem.loss(x, part) for x in starts], nan=np.inf))
         ended = refine(problem, starts[order[0]][None], part, gain=ROUGH)
         if len(order) > 1 and ended.loss > (1.0 - _LITTLE) * most:

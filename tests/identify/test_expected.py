@@ -13,7 +13,7 @@ NO_MOTION = np.zeros(40)
 
 
 def part(name, ahead, free):
-    return HeldOutPart(name, (), {}, {}, {JOINT.column: ahead}, {JOINT.column: free}, run_s=4.0)
+    return HeldOutPart(name, {}, {}, {JOINT.column: ahead}, {JOINT.column: free}, run_s=4.0)
 
 
 def samples(error, measured=None):

@@ -199,7 +199,7 @@ def test_a_part_that_alone_determines_a_parameter_is_named_where_it_decides_the_
     shares = [{"gain": 0.3, "damping": (1.0 - share) / 2}, {"gain": 0.4, "damping": share}, {"gain": 0.3, "damping": 0}]
     errors = (0.008, 0.2, others)
     rows = zip("abc", shares, errors, strict=True)
-    parts = [HeldOutPart(name, (), {}, of, {"th": error, "tilt": None}) for name, of, error in rows]
+    parts = [HeldOutPart(name, {}, of, {"th": error, "tilt": None}) for name, of, error in rows]
     expected = [ExpectedError(c, c, "rad", AHEAD, 1.0, 0.25) for c in ("tilt", "th")]
     sentence = verdict.decisive_part(parts, expected)
     assert bool(sentence) == (share > 0.99 and others < 0.1)

@@ -21,7 +21,7 @@ ANGLE = Position("th", "tilt", "rad", 0.001)
 
 
 def left(name, value=1.0, ahead=0.1, share=0.2, **more):
-    return HeldOutPart(name, (), {"gain": value}, {"gain": share}, {"th": ahead}, **more)
+    return HeldOutPart(name, {"gain": value}, {"gain": share}, {"th": ahead}, **more)
 
 
 def at_point(x):
@@ -78,7 +78,7 @@ def test_what_one_part_alone_determines_widens_as_the_others():
     spread = Uncertainty(square, error, 0.98 * two, 1.02 * two, ("ok",) * 2, 1.0)
     values, shares = np.array([0.9, 1.0, 1.1, 1.05, 0.95]), [0.0, 0.9, 0.1, 0.0, 0.0]
     rows = [
-        HeldOutPart(str(k), (), {"gain": v, "touch": 1.0 + 5.0 * s}, {"gain": 0.2, "touch": s}, {"th": 0.1})
+        HeldOutPart(str(k), {"gain": v, "touch": 1.0 + 5.0 * s}, {"gain": 0.2, "touch": s}, {"th": 0.1})
         for k, (v, s) in enumerate(zip(values, shares, strict=True))
     ]
     found = widened(spread, table, at_point(two), rows)
