@@ -417,7 +417,7 @@ SHOWN = {
     ("arm", "fast"): ("Arm, time to stay within 1 cm", "settled_s", 1.0, "s"),
     ("so101", "follow"): ("SO-101, figure of eight: error", "error_m", 1e3, "mm"),
     ("so101", "fast"): ("SO-101, time to stay within 1 cm", "settled_s", 1.0, "s"),
-    ("go2", "walk"): ("Go2, velocity steps with pushes: error", "error_m_s", 1.0, "m/s"),
+    ("go2", "walk"): ("Go2, pushed: error of the velocity", "error_m_s", 1.0, "m/s"),
 }
 """Robot and task -> what tables and the figure show: label, figure of a deployment, factor, unit."""
 UNLEARNT = 0.1
