@@ -36,6 +36,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--faults", nargs="*", default=list(FAULTS), help="faults that are drawn")
     parser.add_argument("--kinds", nargs="*", default=list(KINDS), help="kinds of robots that are drawn")
     parser.add_argument("--efferent", action="store_true", help="contract faults alone, audited by efferent too")
+    parser.add_argument("--workers", type=int, default=min(2, os.cpu_count() or 1), help="deployments at a time")
     parser.add_argument("--first-seed", type=int, default=0, help="seed of the first robot")
 
 
@@ -119,8 +120,7 @@ def run(options: argparse.Namespace) -> Report:
     drawn = np.random.default_rng(options.first_seed).permutation(len(pairs))[: options.pairs]
     cases += [(chosen(pairs[p])[i % len(chosen(pairs[p]))], seeds[i], pairs[p]) for i, p in enumerate(drawn)]
 
-    workers = min(2, os.cpu_count() or 1)
-    with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+    with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
         results = list(pool.map(partial(one, options.seconds, options.efferent), cases))
     rows: list[Row] = []
     of = lambda wanted: [(set(n), set(e)) for (_, _, f), (n, _, e) in zip(cases, results, strict=True) if wanted(f)]  # noqa: E731
@@ -140,7 +140,7 @@ def run(options: argparse.Namespace) -> Report:
         rows.append(row("doctor/two faults", sum(both), f"of {len(both)}", "", f">= {0.6 * len(both):g}"))
     slowest = max(took_s for _, took_s, _ in results)
     rows.append(
-        row("doctor/longest", round(slowest, 1), "s", f"logs of {options.seconds:g} s, {workers} processes", "")
+        row("doctor/longest", round(slowest, 1), "s", f"logs of {options.seconds:g} s, {options.workers} processes", "")
     )
     listed = [{"kind": k, "seed": s, "faults": list(f), "named": n, "took_s": round(t, 1), "efferent": e}
               for (k, s, f), (n, t, e) in zip(cases, results, strict=True)]  # fmt: skip

@@ -9,15 +9,17 @@ from typing import Any
 import numpy as np
 
 from sim2real.doctor.contract import UNMEASURED, Policy
-from sim2real.doctor.deployed import Deployed, Making
+from sim2real.doctor.deployed import Deployed
 from sim2real.doctor.log import Log
-from sim2real.doctor.plant import Drives, Plant, lowest_points, mujoco
+from sim2real.doctor.plant import Drives, lowest_points, mujoco
+from sim2real.doctor.search import Setting
 
 _SECONDS = 4.0
-_DELAYS = {f"{1e3 * s:.0f} ms": Plant((("delay_s", s),)) for s in (0.0, 0.005, 0.01, 0.02, 0.03, 0.04)}
-_PLANTS = {"0.7 of the gains": Plant((("kd", 0.7), ("kp", 0.7))), "1.3 of the gains": Plant((("kd", 1.3), ("kp", 1.3))),
-           "no dry friction": Plant((("friction", -1.0),)),
-           "dry friction of 5% of the largest torque": Plant((("friction", 0.05),))}  # fmt: skip
+_DELAYS = {f"{1e3 * s:.0f} ms": Setting((("delay_s", s),)) for s in (0.0, 0.005, 0.01, 0.02, 0.03, 0.04)}
+_PLANTS = {"0.7 of the gains": Setting((("kd", 0.7), ("kp", 0.7))),
+           "1.3 of the gains": Setting((("kd", 1.3), ("kp", 1.3))),
+           "no dry friction": Setting((("friction", -1.0),)),
+           "dry friction of 5% of the largest torque": Setting((("friction", 0.05),))}  # fmt: skip
 _STARTS, _POSE_RAD, _TILT_RAD = 8, 0.25, 0.15
 _LARGE = (1.0, 10.0, 1000.0)
 _UPRIGHT, _FAST_RAD_S = 0.5, 3.0
@@ -55,11 +57,11 @@ def examine(policy: Policy, drives: Drives) -> dict[str, Any]:
               f"{change:.0%} of their deviation" for name, change in unmeasured.items() if change > 0.02]  # fmt: skip
 
     # The policy in the model, as trained and with what a robot may have.
-    nominal = _run(policy, drives, Plant())
+    nominal = _run(policy, drives, Setting())
     limit = max(3.0 * nominal.speed, _FAST_RAD_S)
     runs = {name: _run(policy, drives, plant) for name, plant in {**_DELAYS, **_PLANTS}.items()}
     stands = {name: run.up and run.speed < limit for name, run in runs.items()}
-    starts = sum(_run(policy, drives, Plant(), np.random.default_rng(seed)).up for seed in range(_STARTS))
+    starts = sum(_run(policy, drives, Setting(), np.random.default_rng(seed)).up for seed in range(_STARTS))
     if not nominal.up:
         text = f"in the model itself the policy fails after {nominal.until_s:.2f} s, without a command and a delay"
         lines.insert(0, f"{text}: the contract or the model is not that of the training")
@@ -82,7 +84,7 @@ def examine(policy: Policy, drives: Drives) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _run(policy: Policy, drives: Drives, plant: Plant, start: np.random.Generator | None = None) -> Run:
+def _run(policy: Policy, drives: Drives, plant: Setting, start: np.random.Generator | None = None) -> Run:
     """Let the policy act in the model, with the command 0; ``start`` draws another start."""
     c, d = policy.contract, drives
     model = d.with_plant(plant, np.minimum(d.limit, d.kp))  # the largest torque: by the model, or for 1 rad
@@ -122,11 +124,11 @@ def _run(policy: Policy, drives: Drives, plant: Plant, start: np.random.Generato
             log = Log(times, times, q, dq, quats, gyros, np.zeros((count, 3)), np.zeros((count, size)), None,
                       np.roll(actions, -1, 0))  # fmt: skip
             deployed = Deployed(log, policy)
-            action = policy(deployed.observations(Making(), np.array([count - 1])))[0]
+            action = policy(deployed.observations(Setting(), np.array([count - 1])))[0]
             if not np.isfinite(action).all():
                 return Run(False, now, np.inf, 1.0, 1.0)
-            target = deployed.targets(Making(), action[None])[0]
-            commands.append((now + plant.number("delay_s", 0.0), target))
+            target = deployed.targets(Setting(), action[None])[0]
+            commands.append((now + plant.get("delay_s", 0.0), target))
             clipped.append(np.abs(d.torque(target, q[-1], dq[-1])) > d.limit)
             beyond.append(bounded & ((target < low) | (target > high)))
         while len(commands) > 1 and commands[1][0] <= now:

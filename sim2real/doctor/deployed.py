@@ -1,11 +1,35 @@
-"""What a deployment makes of measurements and actions: observations and targets, for any way of making them."""
+"""What a deployment makes of measurements and actions: observations and targets, for any way of making them.
+
+A way is a ``Setting``, of what differs from the contract:
+
+| name | value |
+|---|---|
+| a kind of a term, ``action_scale`` | factor beside the contract's scale |
+| ``degrees KIND`` | whether the joints' angles or rates are in degrees before the pose is taken off |
+| ``order SIDE`` | entry i of the policy is joint ``order[i]`` of the contract; sides: ``seen``, ``moved`` |
+| ``signs SIDE``, ``turned SIDE`` | signs of the entries: of the distance from the default pose, of the angle itself |
+| ``pose SIDE`` | what the default pose has too much [rad] |
+| ``frame KIND`` | a key of ``FRAMES``, or the signed axes of a vector, such as ``(2, 1, -3)`` |
+| ``late`` | age of the measurements beyond the newest in the log [s] |
+| ``stale`` | steps by which a whole observation is older |
+| ``frozen`` | share of the log after which gyro and gravity in the observation do not change |
+| ``stuck`` | (joint, share): after which a joint in the observation does not change |
+| ``history`` | ``reversed``, ``layout``: by step and not by term, or the reverse; ``newest`` in all places |
+| ``terms`` | term i of the observation is term ``terms[i]`` of the contract |
+| ``last_action is`` | ``older``: that of the step before; ``target``: after scale and pose |
+| ``clipped`` | whether actions end at the logged range |
+| ``normalised`` | how often the normaliser is applied |
+| ``gain``, ``bias`` | of each entry of the observation: another normaliser |
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
+import msgspec
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -13,74 +37,23 @@ from sim2real.doctor.contract import Policy
 from sim2real.doctor.log import Log
 from sim2real.doctor.search import Setting
 
-FRAMES = {"world": "in the world's frame instead of the body's", "twice": "rotated into the body twice",
-          "conjugate": "rotated the wrong way"}  # fmt: skip
 _ROWS = 300
-
-
-@dataclass(frozen=True)
-class Joints:
-    """How a deployment takes the policy's joints from the robot's, or back; the default is the contract's way.
-
-    Attributes:
-        order: Entry i of the policy is joint ``order[i]`` of the contract; empty: joint i.
-        signs: Of each entry; ``whole``: they turn the angle itself, and not its distance from the default pose.
-        offset: What the default pose has too much [rad].
-    """
-
-    order: tuple[int, ...] = ()
-    signs: tuple[float, ...] = ()
-    whole: bool = False
-    offset: tuple[float, ...] = ()
-
-    def taken(self, robot: np.ndarray, pose: Any) -> np.ndarray:
-        """Return the policy's angles less the pose for the robot's ``(N, J)``."""
-        rest = pose + np.array(self.offset or 0.0)
-        return self.rates(robot) - (rest if self.whole else rest * self._signs)
-
-    def given(self, policy: np.ndarray, pose: np.ndarray) -> np.ndarray:
-        """Return the robot's angles for the policy's less the pose; the inverse of ``taken``."""
-        rest = pose + np.array(self.offset or 0.0)
-        placed = np.empty_like(policy)
-        placed[:, self._order] = policy * self._signs + (rest * self._signs if self.whole else rest)
-        return placed
-
-    def rates(self, robot: np.ndarray) -> np.ndarray:
-        """Return the policy's velocities for the robot's ``(N, J)``."""
-        return robot[:, self._order] * self._signs
-
-    @property
-    def _order(self) -> Any:
-        return list(self.order) or slice(None)
-
-    @property
-    def _signs(self) -> np.ndarray:
-        return np.array(self.signs or 1.0)
-
-
-@dataclass(frozen=True)
-class Making(Setting):
-    """How a deployment makes observations of measurements, and targets of actions; the default is the contract's.
-
-    Its numbers are factors beside the contract's scales, by kind and ``action_scale``; ``frozen``: share of the log
-    after which the IMU's entries do not change; ``late``: age of the measurements beyond the newest one in the log [s];
-    ``reversed``: 1 for a history in the reversed order; ``normalised``: how often the normaliser is applied.
-
-    Attributes:
-        seen, moved: The joints in the observation and in the targets.
-        vectors: Kind of a vector -> one of ``FRAMES``, or the signs of its entries.
-        gain, bias: Of each entry of the observation: another normaliser.
-    """
-
-    seen: Joints = Joints()
-    moved: Joints = Joints()
-    vectors: tuple[tuple[str, Any], ...] = ()
-    gain: tuple[float, ...] = ()
-    bias: tuple[float, ...] = ()
+_turned = lambda turn, v: np.einsum("nij,nj->ni", turn, v)  # noqa: E731
+_back = lambda turn, v: np.einsum("nji,nj->ni", turn, v)  # noqa: E731
+FRAMES: dict[str, tuple[str, Callable[[np.ndarray, np.ndarray], np.ndarray]]] = {
+    "world": ("in the world's frame instead of the body's", lambda quat, v: _turned(matrices(quat), v)),
+    "twice": ("rotated into the body twice", lambda quat, v: _back(matrices(quat), v)),
+    "conjugate": ("rotated the wrong way", lambda quat, v: _turned(matrices(quat), _turned(matrices(quat), v))),
+    "w last": ("made of a quaternion w, x, y, z that is read as x, y, z, w",
+               lambda quat, v: _back(matrices(np.roll(quat, 1, 1)), _turned(matrices(quat), v))),
+    "w first": ("made of a quaternion x, y, z, w that is read as w, x, y, z",
+                lambda quat, v: _back(matrices(np.roll(quat, -1, 1)), _turned(matrices(quat), v))),
+}  # fmt: skip
+"""Wrong frame -> what it is in words, and the vector that a deployment has of quaternions and vectors in the body."""
 
 
 class Deployed:
-    """A log beside its policy: observations, actions and targets for any making."""
+    """A log beside its policy: observations, actions and targets for any way of making them."""
 
     def __init__(self, log: Log, policy: Policy) -> None:
         self.log, self.policy, self.contract = log, policy, policy.contract
@@ -91,7 +64,7 @@ class Deployed:
         self.history = max(term.history for term in c.observation)
         first = min(max(self.history + 1, len(log.t) // 10), len(log.t) // 2)
         self.rows = np.unique(np.linspace(first, len(log.t) - 1, _ROWS).astype(int))
-        widths = {kind: values.shape[1] for kind, values in self.quantities(Making()).items()}
+        widths = {kind: values.shape[1] for kind, values in self.quantities(Setting()).items()}
         fitting = [term for term in c.observation if widths.get(term.kind) == c.size_of(term)]
         self.made = {term.kind for term in fitting}
         self.unread = [term.term for term in c.observation if term not in fitting]
@@ -99,53 +72,72 @@ class Deployed:
     def _state(self, late_s: float) -> dict[str, np.ndarray]:
         if late_s not in self._states:
             names = [n for n in ("q", "dq", "quat", "gyro", "lin_vel") if getattr(self.log, n) is not None]
-            found = {n: self.log.at_steps(n, late_s) for n in names}
-            if "quat" in found:
-                found["turn"] = matrices(found.pop("quat"))
-            self._states[late_s] = found
+            self._states[late_s] = {n: self.log.at_steps(n, late_s) for n in names}
         return self._states[late_s]
 
-    def quantities(self, how: Making) -> dict[str, np.ndarray]:
+    def quantities(self, how: Setting) -> dict[str, np.ndarray]:
         """Return the newest entries of each kind at each step ``(N, size)``, before the contract's scale."""
-        state, count = self._state(how.number("late", 0.0)), len(self.log.t)
-        if (frozen := how.number("frozen")) < 1.0:
-            held = np.minimum(np.arange(count), int(frozen * count))
-            state = state | {k: state[k][held] for k in ("turn", "gyro") if k in state}
+        state, count = self._state(how.get("late", 0.0)), len(self.log.t)
+        if "frozen" in how:
+            held = np.minimum(np.arange(count), int(how.get("frozen") * count))
+            state = state | {k: state[k][held] for k in ("quat", "gyro") if k in state}
+        if "stuck" in how:
+            joint, share = how.get("stuck")
+            state = state | {k: state[k].copy() for k in ("q", "dq")}
+            for k in ("q", "dq"):
+                state[k][int(share * count) :, joint] = state[k][int(share * count), joint]
         pose = self._pose * any(t.relative for t in self.contract.observation if t.kind == "joint_pos")
-        bare = replace(how.seen, offset=()).taken(state["q"], 0.0)
-        made = {"joint_pos": how.seen.taken(state["q"], pose), "joint_vel": how.seen.rates(state["dq"]),
+        angles = np.degrees if how.get("degrees joint_pos", False) else np.asarray
+        rates = np.degrees if how.get("degrees joint_vel", False) else np.asarray
+        bare = _taken(how, "seen", state["q"], 0.0 * pose)
+        made = {"joint_pos": _taken(how, "seen", angles(state["q"]), pose + np.array(how.get("pose seen", 0.0))),
+                "joint_vel": _taken(how, "seen", rates(state["dq"]), 0.0 * pose),
                 "sin_joint_pos": np.sin(bare), "cos_joint_pos": np.cos(bare)}  # fmt: skip
         made |= {kind: state[n] for kind, n in (("ang_vel", "gyro"), ("lin_vel", "lin_vel")) if n in state}
-        if "turn" in state:
-            made["gravity"] = -state["turn"][:, 2, :]
+        if "quat" in state:
+            made["gravity"] = -matrices(state["quat"])[:, 2, :]
         if self.log.command is not None:
             made["command"] = self.log.command
         if (action := self.actions(how)) is not None:
-            made["last_action"] = np.concatenate([np.zeros((1, action.shape[1])), action[:-1]])
-        for kind, change in how.vectors:
-            made[kind] = in_frame(state["turn"], made[kind], change) if change in FRAMES else made[kind] * change
-        return {kind: values * how.number(kind) for kind, values in made.items()}
+            ago = 2 if how.get("last_action is", "") == "older" else 1
+            last = self.targets(how, action) if how.get("last_action is", "") == "target" else action
+            made["last_action"] = np.concatenate([np.zeros((ago, action.shape[1])), last[:-ago]])
+        for kind in ("ang_vel", "gravity", "lin_vel"):
+            if f"frame {kind}" in how and kind in made:
+                made[kind] = in_frame(how.get(f"frame {kind}"), state.get("quat"), made[kind])
+        return {kind: values * how.get(kind) for kind, values in made.items()}
 
-    def actions(self, how: Making) -> np.ndarray | None:
+    def actions(self, how: Setting) -> np.ndarray | None:
         """Return the network's actions ``(N, A)``: the logged ones, or those that the targets say."""
         if self.log.action is not None or self.log.target is None:
             return self.log.action
-        return how.moved.taken(self.log.target, self._resting) / (self._scale * how.number("action_scale"))
+        rest = self._resting + np.array(how.get("pose moved", 0.0))
+        return _taken(how, "moved", self.log.target, rest) / (self._scale * how.get("action_scale"))
 
-    def targets(self, how: Making, action: np.ndarray) -> np.ndarray:
+    def targets(self, how: Setting, action: np.ndarray) -> np.ndarray:
         """Return the targets ``(N, J)`` that actions ``(N, A)`` give."""
-        return how.moved.given(action * self._scale * how.number("action_scale"), self._resting)
+        signs, turned = np.array(how.get("signs moved")), np.array(how.get("turned moved"))
+        rest = self._resting + np.array(how.get("pose moved", 0.0))
+        placed = np.empty_like(action)
+        order = list(how.get("order moved", ())) or slice(None)
+        placed[:, order] = action * self._scale * how.get("action_scale") * signs * turned + rest * turned
+        return placed
 
-    def observations(self, how: Making, rows: np.ndarray) -> np.ndarray:
+    def observations(self, how: Setting, rows: np.ndarray) -> np.ndarray:
         """Return the observations ``(R, O)`` at some steps, before the normaliser."""
         c, made, parts = self.contract, self.quantities(how), []
+        order, history = how.get("terms", ()), how.get("history", "")
+        if order or history == "layout":
+            other = {"term": "step", "step": "term"}[c.history_layout] if history == "layout" else c.history_layout
+            terms = tuple(c.observation[i] for i in order) or c.observation
+            c = msgspec.structs.replace(c, observation=terms, history_layout=other)
         for term, lag in c.layout:
             own = c.observation[term]
-            back = own.history - 1 - lag if how.number("reversed", 0.0) else lag
+            back = {"reversed": own.history - 1 - lag, "newest": 0}.get(history, lag)
             if own.kind in self.made:
                 parts.append(made[own.kind][np.maximum(rows - back, 0)] * np.asarray(own.scale, float))
             elif self.log.obs is not None:
-                parts.append(self.logged_block(term, lag)[rows])
+                parts.append(self.logged_block(order[term] if order else term, lag)[rows])
             else:
                 parts.append(np.zeros((len(rows), c.size_of(own))))
         return np.concatenate(parts, axis=1)
@@ -160,7 +152,7 @@ class Deployed:
         obs, c = self.log.obs, self.contract
         if obs is None or not c.mean or obs.shape[1] != c.size:
             return obs
-        rebuilt = Deployed(replace(self.log, obs=None), self.policy).observations(Making(), self.rows)
+        rebuilt = Deployed(replace(self.log, obs=None), self.policy).observations(Setting(), self.rows)
         gap = lambda values: np.median(np.abs(values[self.rows] - rebuilt) / (rebuilt.std(0) + 1e-3))  # noqa: E731
         before = obs * np.array(c.std) + np.array(c.mean)
         return before if gap(before) < 0.5 * gap(obs) else obs
@@ -169,6 +161,12 @@ class Deployed:
     def acted(self) -> np.ndarray:
         """The logged actions, or the network's on the logged observations ``(N, A)``."""
         return self.log.action if self.log.action is not None else self.policy(known(self.logged))
+
+
+def _taken(how: Setting, side: str, robot: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    """Return the policy's entries less the pose for the robot's ``(N, J)``; the inverse of ``Deployed.targets``."""
+    signs, order = np.array(how.get(f"signs {side}")), list(how.get(f"order {side}", ())) or slice(None)
+    return robot[:, order] * signs * np.array(how.get(f"turned {side}")) - rest * signs
 
 
 def known(values: np.ndarray | None) -> np.ndarray:
@@ -182,9 +180,9 @@ def matrices(quat: np.ndarray) -> np.ndarray:
     return Rotation.from_quat(quat, scalar_first=True).as_matrix()
 
 
-def in_frame(turn: np.ndarray, body: np.ndarray, frame: str) -> np.ndarray:
-    """Return vectors of the body, as a deployment with a wrong frame has them."""
-    if frame == "twice":
-        return np.einsum("nji,nj->ni", turn, body)
-    world = np.einsum("nij,nj->ni", turn, body)
-    return world if frame == "world" else np.einsum("nij,nj->ni", turn, world)
+def in_frame(change: Any, quat: np.ndarray | None, body: np.ndarray) -> np.ndarray:
+    """Return vectors of the body ``(N, 3)``, as a deployment with a wrong frame or wrong axes has them."""
+    if isinstance(change, str):
+        return FRAMES[change][1](known(quat), body)
+    axes = np.array(change)
+    return body[:, np.abs(axes) - 1] * np.sign(axes)

@@ -112,7 +112,7 @@ def solve_timing(log: Log, contract: Contract, sim: Log | None = None) -> tuple[
     steps = np.diff(log.t)
     period = float(np.median(steps) if log.grain_s == 0.0 else np.mean(steps[steps < 1.6 * np.median(steps)]))
     wanted = 1.0 / contract.rate_hz if sim is None else float(np.median(np.diff(sim.t)))
-    jitter_s = max(0.0, float(np.quantile(np.abs(steps - period), 0.9)) - log.grain_s)
+    jitter_s = max(0.0, round(float(np.quantile(np.abs(steps - period), 0.9)) - log.grain_s, 6))
     lost = float(np.mean(steps > 1.6 * period + log.grain_s))
     figures = {"rate_hz": 1.0 / period, "trained_rate_hz": 1.0 / wanted, "jitter_s": jitter_s, "lost": lost}
     findings = []

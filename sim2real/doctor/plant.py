@@ -16,73 +16,79 @@ import numpy as np
 from sim2real.doctor.contract import Contract
 from sim2real.doctor.deployed import known, matrices
 from sim2real.doctor.log import Log
-from sim2real.doctor.search import Candidate, Dial, Finding, Setting, explain, shortened
+from sim2real.doctor.search import Candidate, Finding, Setting, Suspect, explain, shortened
 from sim2real.errors import UsageError
 
 _STEP_S, _WINDOW_S, _WINDOWS = 0.0025, 0.2, 40
+_FASTEST = 0.25
+"""Share of the windows that begin where most torque is asked for: a limit acts there, and hardly elsewhere."""
 _LATER_S = 0.010
 """A delay that is longer by this than that of the training is a fault [s]; a training without a known delay had none,
 and the first 10 ms are those of any robot."""
-_LOWER = 0.75
-"""A torque limit is a fault if it is below this share of the model's: drives that lag look limited a little earlier."""
 _UPRIGHT = 0.8
 """Cosine of the tilt up to which a free robot stands."""
+_FILM_S, _FRAMES = 1.0, 40
 mujoco: Any = mujoco_c  # its C module has no stubs
 
 
-@dataclass(frozen=True)
-class Plant(Setting):
-    """How drives and bodies differ from the model.
+@dataclass(frozen=True, kw_only=True)
+class _Part(Suspect):
+    """A number in which a plant may differ from the model; in its text ``who`` is a joint, or the drives.
 
-    Its numbers: ``delay_s`` from a target in the log to the motion in the log [s]; ``kp``, ``kd``: factors beside the
-    contract's gains; ``friction``: dry friction beside the model's, a share of the largest torques that are asked for;
-    ``armature``: inertia beside the model's, a share of it; ``payload``: mass of the loaded body beside the model's,
-    a share of the robot's. Of one joint: ``kp JOINT``, and ``limit JOINT``, a share of its largest torque.
+    It is a fault if its value is off, and the replay without it has a clearly larger error, with all others estimated
+    again.
+
+    Attributes:
+        usual: The model's value.
+        is_off: Whether a value may be a fault.
+        drop: Share of the error without it by which it must lower it to be a fault.
+        of: Whether it is a number of ``all`` joints, of ``one`` of them, of all or ``one too``, of ``some``, or of all
+            and estimated ``with the rest``.
     """
 
-
-@dataclass(frozen=True)
-class _Part:
-    """A number of the plant: what the model says, and when another value is a fault.
-
-    It is one only if the replay without it has a clearly larger error, with all others estimated again.
-    """
-
-    dial: Dial
-    usual: float
+    usual: float = 0.0
     is_off: Callable[[float], bool]
+    least: float = 0.2
+    drop: float = 0.2
+    of: str = "all"
+
+    def of_joint(self, joint: str) -> _Part:
+        """Return the same number of one joint; an empty name: of all."""
+        text = str(self.text).replace("{who}", joint or "the drives")
+        return replace(self, names=(f"{self.names[0]} {joint}".strip(),), text=text)
 
 
-_FACTORS = np.array((0.85, 0.93, 1.07, 1.17))
-_PARTS = {
-    "kp": _Part(Dial("gain", "the drives are {value:.2f} times as stiff as the contract says",
-                     (0.35, 0.5, 0.65, 0.8, 1.25, 1.6, 2.2), lambda f: f * _FACTORS, 0.07),
-                1.0, lambda f: not 0.72 <= f <= 1.4),
-    "friction": _Part(Dial("friction", "the joints have more dry friction than the model: {value:.0%} of their largest "
-                           "torque", (-0.1, 0.05, 0.1, 0.2, 0.4), lambda f: f + np.array((-0.03, -0.01, 0.01, 0.03)),
-                           0.2),
-                      0.0, lambda share: share > 0.08),
-    "armature": _Part(Dial("armature", "the joints have {value:+.0%} of their inertia beside the model's",
-                           (-0.4, 0.5, 1.0, 2.0, 4.0), lambda f: f + np.array((-0.3, -0.1, 0.1, 0.3)), 0.2),
-                      0.0, lambda share: abs(share) > 0.45),
-    "payload": _Part(Dial("payload", "the robot carries {value:+.0%} of its mass beside the model's",
-                          (-0.1, 0.1, 0.2, 0.4), lambda f: f + np.array((-0.05, -0.02, 0.02, 0.05)), 0.2),
-                     0.0, lambda share: abs(share) > 0.2),
-}  # fmt: skip
-_DELAY = Dial("delay", "", (0.0, 0.007, 0.014, 0.021, 0.028, 0.035, 0.045, 0.06),
-              lambda s: np.maximum(0.0, s + np.array((-0.005, -0.0015, 0.0015, 0.005))))  # fmt: skip
-_DAMPING = Dial("", "", (1.0,), lambda f: f * np.array((0.8, 1.25)))
-
-
-def _of_one(joint: str) -> _Part:
-    """Return the gain of one joint."""
-    text = f"{joint} is {{value:.2f}} times as stiff as the contract says"
-    return replace(_PARTS["kp"], dial=replace(_PARTS["kp"].dial, text=text))
-
-
-_LIMITS = (0.05, 0.08, 0.12, 0.17, 0.24, 0.33, 0.45, 0.6)
-_NUISANCE = (_DELAY.move("delay_s"), _DAMPING.move("kd"))
-"""Delay and damping of drives are estimated with anything else."""
+_PARTS = {part.names[0]: part for part in (
+    _Part("gain", ("kp",), "{who}: {value:.2f} times the contract's stiffness", (0.35, 0.5, 0.65, 0.8, 1.25, 1.6, 2.2),
+          lambda f: f * np.array((0.85, 0.93, 1.07, 1.17)), usual=1.0, is_off=lambda f: not 0.72 <= f <= 1.4,
+          least=0.07, drop=0.07, of="one too"),
+    _Part("friction", ("friction",), "{who}: more dry friction than the model's, by {value:.0%} of the largest torque",
+          (-0.1, 0.05, 0.1, 0.2, 0.4), lambda f: f + np.array((-0.03, -0.01, 0.01, 0.03)), is_off=lambda f: f > 0.08,
+          of="one too"),
+    _Part("armature", ("armature",), "{who}: {value:+.0%} of the inertia beside the model's",
+          (-0.4, 0.5, 1.0, 2.0, 4.0), lambda f: f + np.array((-0.3, -0.1, 0.1, 0.3)), is_off=lambda f: abs(f) > 0.45),
+    _Part("payload", ("payload",), "the robot carries {value:+.0%} of its mass beside the model's",
+          (-0.1, 0.1, 0.2, 0.4), lambda f: f + np.array((-0.05, -0.02, 0.02, 0.05)), is_off=lambda f: abs(f) > 0.2),
+    _Part("zero offset", ("zero",), "{who}: it is driven as if its angle were another by {value:+.3f} rad",
+          (-0.25, -0.12, -0.05, 0.05, 0.12, 0.25), lambda a: a + np.array((-0.05, -0.015, 0.015, 0.05)),
+          is_off=lambda a: abs(a) > 0.06, of="one"),
+    _Part("battery", ("fade",), "{who}: stiffness and largest torque fall by {value:.0%} from the log's start on",
+          (0.2, 0.4, 0.6), lambda f: np.minimum(f + np.array((-0.1, -0.03, 0.03, 0.1)), 0.95),
+          is_off=lambda f: f > 0.2),
+    # A limit above three quarters of the model's is none: drives that lag look limited a little earlier.
+    _Part("torque limit", ("limit",), "torque is clipped: {value}", (0.05, 0.08, 0.12, 0.17, 0.24, 0.33, 0.45, 0.6),
+          lambda f: f * np.array((0.87, 0.93, 1.07, 1.15)), usual=np.inf, is_off=lambda f: f < 0.75, least=0.12,
+          drop=0.17, of="some"),
+    _Part("damping", ("kd",), "{who}: {value:.2f} times the contract's damping", (1.0,),
+          lambda f: f * np.array((0.8, 1.25)), usual=1.0, is_off=lambda f: not 0.4 <= f <= 2.2, of="with the rest"),
+)}  # fmt: skip
+"""Name in a setting -> what it is: factors of the contract's gains, shares of the largest torque asked for (friction,
+limit), of the joint's inertia (armature) and of the robot's mass (payload), an angle [rad], and a share of the gains
+(fade); ``NAME JOINT`` is that of one joint. ``kd`` and ``delay_s``, from a target in the log to the motion [s], are
+estimated with anything else."""
+_DELAY = Suspect("delay", ("delay_s",), "", (0.0, 0.007, 0.014, 0.021, 0.028, 0.035, 0.045, 0.06),
+                 lambda s: np.maximum(0.0, s + np.array((-0.005, -0.0015, 0.0015, 0.005))))  # fmt: skip
+_NUISANCE = (_DELAY.move, _PARTS["kd"].move)
 
 
 _TURNING = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
@@ -169,21 +175,28 @@ class Drives:
         """Return the torques that targets ask for [N m]."""
         return target if self.torque_driven else self.kp * (target - q) - self.kd * dq
 
-    def with_plant(self, plant: Plant, asked: np.ndarray) -> Any:
-        """Return a copy of the model with other drives; ``asked``: the largest torques of the targets ``(J,)``."""
+    def with_plant(self, plant: Setting, asked: np.ndarray, at: float = 0.0) -> Any:
+        """Return a copy of the model with other drives.
+
+        Args:
+            asked: The largest torques of the targets ``(J,)`` [N m].
+            at: The moment as a share of the log.
+        """
         model = copy.copy(self.model)
-        per_joint = lambda name, usual: np.array([plant.number(f"{name} {j}", usual) for j in self.joints])  # noqa: E731
-        kp = self.kp * plant.number("kp") * per_joint("kp", 1.0)
+        each = lambda name, usual: np.array([plant.get(f"{name} {j}", usual) for j in self.joints])  # noqa: E731
+        left = 1.0 - at * plant.get("fade", 0.0)
+        kp = self.kp * plant.get("kp") * each("kp", 1.0) * left
         model.actuator_gainprm[:, 0] = kp
         if not self.torque_driven:
-            model.actuator_biasprm[:, 1], model.actuator_biasprm[:, 2] = -kp, -self.kd * plant.number("kd")
-        limit = np.minimum(self.limit, asked * per_joint("limit", np.inf))
+            model.actuator_biasprm[:, 0] = -kp * each("zero", 0.0)
+            model.actuator_biasprm[:, 1], model.actuator_biasprm[:, 2] = -kp, -self.kd * plant.get("kd")
+        limit = np.minimum(self.limit, asked * each("limit", np.inf) * left)
         model.actuator_forcerange[:, 0], model.actuator_forcerange[:, 1] = -limit, limit
-        friction = model.dof_frictionloss[self.dof] + plant.number("friction", 0.0) * asked
-        model.dof_frictionloss[self.dof] = np.maximum(0.0, friction)
-        model.dof_armature[self.dof] += np.maximum(-model.dof_armature[self.dof],
-                                                   plant.number("armature", 0.0) * self.inertia)  # fmt: skip
-        model.body_mass[self.loaded] += plant.number("payload", 0.0) * float(self.model.body_mass.sum())
+        friction = (plant.get("friction", 0.0) + each("friction", 0.0)) * asked
+        model.dof_frictionloss[self.dof] = np.maximum(0.0, model.dof_frictionloss[self.dof] + friction)
+        armature = np.maximum(-model.dof_armature[self.dof], plant.get("armature", 0.0) * self.inertia)
+        model.dof_armature[self.dof] += armature
+        model.body_mass[self.loaded] += plant.get("payload", 0.0) * float(self.model.body_mass.sum())
         return model
 
 
@@ -191,24 +204,16 @@ class Replay:
     """The log's commands through the model.
 
     Raises:
-        UsageError: The log has no targets.
+        UsageError: The log has no targets, or too little of a robot that stands.
     """
 
     def __init__(self, drives: Drives, log: Log) -> None:
         if log.target is None:
             raise UsageError("the plant needs the targets that were sent to the drives, and the log has none")
         self.drives, self.log = drives, log
-        # Windows that are spread over the log; the first second has the start's motion.
         count = round(_WINDOW_S / drives.model.opt.timestep)
-        begin, end = max(log.state_t[0], log.t[0]) + 0.3, min(log.state_t[-1], log.t[-1]) - _WINDOW_S - 0.01
-        moved = np.linspace(begin, max(begin, end), _WINDOWS)
-        first = np.unique(np.clip(np.searchsorted(log.state_t, moved), 1, len(log.state_t) - 2))
-        self.starts = first[log.state_t[first] + _WINDOW_S <= log.state_t[-1] + 1e-9]
-        if drives.free and log.quat is not None:  # a robot that lies touches the ground with what the model may lack
-            self.starts = self.starts[matrices(log.quat[self.starts])[:, 2, 2] > _UPRIGHT]
-        if len(self.starts) < 3:
-            raise UsageError("the log has less than 1 s of an upright robot, too little for a replay")
         self.step_t = np.arange(count) * drives.model.opt.timestep
+        self.starts = self._windows()
         self.initial = np.array([self._state(k) for k in self.starts])
         # Measurements at the ends of steps.
         after = log.state_t[self.starts][:, None] + self.step_t[None] + drives.model.opt.timestep
@@ -219,13 +224,41 @@ class Replay:
         travel = np.sqrt(np.mean((self.measured - log.q[self.starts][:, None]) ** 2, (0, 1)))
         self.scale = np.maximum(travel, 0.3 * np.median(travel) + 1e-4)
         self._threads = [mujoco.MjData(drives.model) for _ in range(min(2, os.cpu_count() or 1))]
-        self._errors: dict[Plant, np.ndarray] = {}
+        self._errors: dict[Setting, np.ndarray] = {}
+
+    def _windows(self) -> np.ndarray:
+        """Return the measurements from which windows begin: spread over the log, and where most torque is asked for."""
+        log, free = self.log, self.drives.free
+        # A free robot falls on its feet first; any robot's first targets are on their way.
+        begin, end = max(log.state_t[0], log.t[0]) + (0.3 if free else 0.04), min(log.state_t[-1], log.t[-1] + 0.02)
+        rows = np.flatnonzero((log.state_t >= begin) & (log.state_t + _WINDOW_S <= end))
+        quat = log.quat if free else None
+        if quat is not None:  # a robot that lies touches the ground with what the model may lack
+            lying = np.cumsum(matrices(quat)[:, 2, 2] < _UPRIGHT)
+            last = np.searchsorted(log.state_t, log.state_t[rows] + _WINDOW_S).clip(0, len(lying) - 1)
+            rows = rows[lying[last] == lying[rows - 1]]
+        if len(rows) < 3 or np.ptp(log.state_t[rows]) < 0.3:
+            raise UsageError("the log has less than half a second of a robot that stands, too little for a replay")
+        fastest = list[int]()
+        share = np.abs(self._torque / self.asked).max(1) * (not free)
+        for step in np.argsort(-share):
+            row = int(rows[np.searchsorted(log.state_t[rows], log.t[step] - 1e-6).clip(0, len(rows) - 1)])
+            if len(fastest) == round(_FASTEST * _WINDOWS) or share[step] == 0.0:
+                break
+            if min((abs(log.state_t[row] - log.state_t[k]) for k in fastest), default=1.0) > 0.5 * _WINDOW_S:
+                fastest.append(row)
+        spread = rows[np.linspace(0, len(rows) - 1, _WINDOWS - len(fastest)).astype(int)]
+        return np.unique([*fastest, *spread])
+
+    @cached_property
+    def _torque(self) -> np.ndarray:
+        """The torques that the targets ask for at the policy's steps ``(N, J)`` [N m]."""
+        return self.drives.torque(known(self.log.target), self.log.at_steps("q"), self.log.at_steps("dq"))
 
     @cached_property
     def asked(self) -> np.ndarray:
         """The largest torques that the targets ask for ``(J,)`` [N m]."""
-        torque = self.drives.torque(known(self.log.target), self.log.at_steps("q"), self.log.at_steps("dq"))
-        return np.quantile(np.abs(torque), 0.99, axis=0) + 1e-6
+        return np.quantile(np.abs(self._torque), 0.99, axis=0) + 1e-6
 
     def _state(self, k: int) -> np.ndarray:
         """Return MuJoCo's full physics state at a measurement; a free base stands on its lowest points."""
@@ -255,96 +288,112 @@ class Replay:
         mujoco.mj_getState(d.model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
         return state
 
-    def rolled(self, plant: Plant) -> np.ndarray:
-        """Return the simulated states of the windows ``(W, T, 1 + nq + nv)``."""
+    def rolled(self, plant: Setting, initial: np.ndarray | None = None, times: np.ndarray | None = None) -> np.ndarray:
+        """Return simulated states ``(W, T, 1 + nq + nv)``.
+
+        Args:
+            initial: Physics states ``(W, S)``; default: of the windows.
+            times: Times of the simulation's steps ``(W, T)`` [s]; default: of the windows.
+        """
         from mujoco import rollout
 
         log, target, h = self.log, known(self.log.target), self.drives.model.opt.timestep
+        initial = self.initial if initial is None else initial
+        times = log.state_t[self.starts][:, None] + self.step_t[None] if times is None else times
         # The mean of the targets over each step of the simulation, so that a delay acts below its step.
-        times = log.state_t[self.starts][:, None] + self.step_t[None] - plant.number("delay_s", 0.0)
+        wanted = times - plant.get("delay_s", 0.0)
         knots = np.concatenate([log.t[:1] - 1.0, log.t, log.t[-1:] + 1.0])
         held = np.concatenate([target[:1], target])
         area = np.concatenate([np.zeros((1, len(self.scale))), np.cumsum(held * np.diff(knots)[:, None], axis=0)])
         until = lambda at: np.stack([np.interp(at, knots, column) for column in area.T], -1)  # noqa: E731
-        control = (until(times + h) - until(times)) / h
-        model = self.drives.with_plant(plant, self.asked)
-        return np.asarray(rollout.rollout(model, self._threads, self.initial, control)[0])
+        control = (until(wanted + h) - until(wanted)) / h
+        ats = (times[:, 0] - log.t[0]) / (log.t[-1] - log.t[0]) if "fade" in plant else [0.0]
+        models = [self.drives.with_plant(plant, self.asked, float(at)) for at in ats]
+        return np.asarray(rollout.rollout(models if len(models) > 1 else models[0], self._threads, initial, control)[0])
 
-    def residuals(self, plant: Plant) -> np.ndarray:
+    def residuals(self, plant: Setting) -> np.ndarray:
         """Return the simulated angles less the measured ones, as a share of the motion ``(W, T, J)``."""
         error = (self.rolled(plant)[:, :, 1 + self.drives.qpos] - self.measured) / self.scale
         return np.where(self.used[:, :, None], np.nan_to_num(error, nan=9.0), 0.0)
 
-    def error(self, plant: Plant) -> float:
+    def error(self, plant: Setting) -> float:
         """Return the mean error of the replay as a share of the joints' motion; each counts at most 1.5."""
         return float(self.errors(plant).mean())
 
-    def errors(self, plant: Plant) -> np.ndarray:
+    def errors(self, plant: Setting) -> np.ndarray:
         """Return the mean errors of the joints ``(J,)``."""
         if plant not in self._errors:
             error = np.minimum(np.abs(self.residuals(plant)), 1.5)
             self._errors[plant] = error.sum((0, 1)) / self.used.sum()
         return self._errors[plant]
 
-    def sag(self, plant: Plant) -> np.ndarray:
+    def sag(self, plant: Setting) -> np.ndarray:
         """Return how far the joints of the robot are from the model's at the ends of the windows, with sign [rad]."""
         last = self.used.shape[1] - 1 - np.argmax(self.used[:, ::-1], axis=1)
         return -np.median(self.residuals(plant)[np.arange(len(last)), last], axis=0) * self.scale
 
-    def candidates(self, plant: Plant) -> Iterator[Candidate[Plant]]:
+    def candidates(self, plant: Setting) -> Iterator[Candidate]:
         """Return what may be wrong beside what is known already."""
-        delay_s, there = plant.number("delay_s", 0.0), dict(plant.numbers)
+        delay_s = plant.get("delay_s", 0.0)
         # Soft or limited drives look late and damped at first.
-        starts = [plant, *(plant.having("kd", 1.0).having("delay_s", d) for d in (delay_s, 0.011, 0.6 * delay_s))]
+        starts = [plant, *(plant.having({"kd": 1.0, "delay_s": d}) for d in (delay_s, 0.011, 0.6 * delay_s))]
         for name, part in _PARTS.items():
-            if name in there or (name == "kp" and self.drives.torque_driven):
+            if self.drives.torque_driven and name in ("kp", "zero"):
                 continue
-            for start in starts if name == "kp" else starts[:1]:
-                yield from part.dial.candidates(start, name, _NUISANCE)
-            if name == "kp" and len(self.scale) > 1:
-                # The joint that moves better with drives of another stiffness may be weak alone.
-                of_all = [self.errors(plant.having("kp", f * plant.number("kp"))) for f in part.dial.grid]
-                better = self.errors(plant) - np.min(of_all, axis=0)
-                joint = self.drives.joints[int(np.argmax(better))]
-                if better.max() > 0.0 and f"kp {joint}" not in there:
-                    yield from _of_one(joint).dial.candidates(plant, f"kp {joint}", _NUISANCE)
-        if any(name.startswith("limit") for name in there):
-            return
-        text = lambda at: f"torque is clipped: {shortened(list(self.limited(at).values()))}"  # noqa: E731
-        for start in starts:
-            # Other gains of one joint, which are no fault, look like its limit.
-            gains = [start.having("kp", p * start.number("kp")).having("kd", d * start.number("kd"))
-                     for p, d in ((0.85, 1.0), (1.18, 1.0), (1.0, 0.7), (1.0, 1.4))]  # fmt: skip
-            limits = [self._all_limited(start, (f,) * len(self.scale)) for f in _LIMITS]
-            yield Candidate(
-                "torque limit", self._mixed([start, *limits, *gains]), text, [self._near_limits, *_NUISANCE]
-            )
+            for start in starts if name in ("kp", "limit") else starts[:1]:
+                if part.of in ("all", "one too") and name not in plant:
+                    yield from part.of_joint("").candidates(start, *_NUISANCE)
+                if part.of == "some" and not self._of_joints(name, plant):
+                    near = lambda at, name=name: [self._mixed([at, *self._near(at, name)], name)]  # noqa: E731
+                    # Other gains of one joint, which are no fault, look like its limit.
+                    others = [start.having({"kp": p * start.get("kp"), "kd": d * start.get("kd")})
+                              for p, d in ((0.85, 1.0), (1.18, 1.0), (1.0, 0.7), (1.0, 1.4))]  # fmt: skip
+                    tried = [start, *(start.having({f"{name} {j}": v for j in self.drives.joints}) for v in part.grid)]
+                    yield Candidate(part.fault, self._mixed([*tried, *others], name), lambda _: "", (near, *_NUISANCE),
+                                    part.least)  # fmt: skip
+            if part.of == "one" or (part.of == "one too" and len(self.scale) > 1):
+                yield from self._of_one(name, plant)
 
-    def _limits(self, plant: Plant) -> np.ndarray:
-        return np.array([plant.number(f"limit {joint}", np.inf) for joint in self.drives.joints])
+    def _of_one(self, name: str, plant: Setting) -> Iterator[Candidate]:
+        """Return a part of the joint that moves better if all joints have it."""
+        part, joints = _PARTS[name], self.drives.joints
+        if part.of == "one":
+            tried = [plant.having({f"{name} {j}": v for j in joints}) for v in part.grid]
+        else:
+            tried = [plant.having({name: v * plant.get(name) if name == "kp" else v}) for v in part.grid]
+        better = self.errors(plant) - np.min([self.errors(p) for p in tried], axis=0)
+        joint = joints[int(np.argmax(better))]
+        if better.max() > 0.0 and f"{name} {joint}" not in plant:
+            yield from part.of_joint(joint).candidates(plant, *_NUISANCE)
 
-    def _all_limited(self, plant: Plant, limits: Sequence[float]) -> Plant:
-        for joint, limit in zip(self.drives.joints, limits, strict=True):
-            plant = plant.having(f"limit {joint}", float(limit)) if np.isfinite(limit) else plant
-        return plant
+    def _of_joints(self, name: str, plant: Setting) -> dict[str, float]:
+        """Return the values of a part by joint, of the joints that have one."""
+        return {j: plant.get(f"{name} {j}") for j in self.drives.joints if f"{name} {j}" in plant}
 
-    def _mixed(self, plants: Sequence[Plant]) -> Plant:
-        """Return the first plant, in which each joint has the limit under which it moves best.
+    def _near(self, plant: Setting, name: str) -> list[Setting]:
+        own = self._of_joints(name, plant)
+        moved = {f"{name} {j}": _PARTS[name].near(value) for j, value in own.items()}
+        return [plant.having(dict(zip(moved, values, strict=True))) for values in zip(*moved.values(), strict=True)]
+
+    def _mixed(self, plants: Sequence[Setting], name: str) -> Setting:
+        """Return the first plant, in which each joint has the value of the plant in which it moves best.
 
         A joint has one only if that explains a tenth of its error.
         """
-        limits = np.array([self._limits(p) for p in plants])
-        errors = np.array([self.errors(p) for p in plants]) * np.where(np.isinf(limits), 0.9, 1.0)
-        return self._all_limited(plants[0], np.take_along_axis(limits, errors.argmin(0)[None], 0)[0].tolist())
+        own = [self._of_joints(name, p) for p in plants]
+        bare = np.array([[j not in values for j in self.drives.joints] for values in own])
+        best = (np.array([self.errors(p) for p in plants]) * np.where(bare, 0.9, 1.0)).argmin(0)
+        kept = Setting(tuple((n, v) for n, v in plants[0].values if not n.startswith(f"{name} ")))
+        return kept.having(
+            {f"{name} {j}": own[k][j] for j, k in zip(self.drives.joints, best, strict=True) if j in own[k]}
+        )
 
-    def _near_limits(self, plant: Plant) -> list[Plant]:
-        moved = [self._all_limited(plant, (f * self._limits(plant)).tolist()) for f in (0.87, 0.93, 1.07, 1.15)]
-        return [self._mixed([plant, *moved])]
-
-    def limited(self, plant: Plant) -> dict[str, str]:
+    def limited(self, plant: Setting) -> dict[str, str]:
         """Return the joints whose torque limit is well below the model's, with the limit in words."""
-        torques = zip(self.drives.joints, self._limits(plant) * self.asked, self.drives.limit, strict=True)
-        return {joint: f"{joint} at {nm:.3g} N m" for joint, nm, of_model in torques if nm < _LOWER * of_model}
+        torques = zip(self.drives.joints, self.asked, self.drives.limit, strict=True)
+        found = {j: (plant.get(f"limit {j}", np.inf) * asked, of_model) for j, asked, of_model in torques}
+        return {j: f"{j} at {nm:.3g} N m" for j, (nm, of_model) in found.items()
+                if _PARTS["limit"].is_off(nm / of_model)}  # fmt: skip
 
 
 def lowest_points(model: Any, data: Any) -> list[tuple[int, np.ndarray]]:
@@ -372,50 +421,47 @@ def solve_plant(
     Args:
         trained_delay_s: Delay of the training; default: the contract's.
     """
-    replay = Replay(drives, log)
-    start = min(_DELAY.candidates(Plant(), "delay_s", _NUISANCE), key=lambda c: replay.error(c.setting))
-    start = start.descended(replay.error)
-    chosen = [start, *explain(start.setting, replay.error, replay.candidates, 0.0, dear=True)]
-    fitted = chosen[-1].setting
+    findings, replay, start = _with_signs(drives, log)
+    fitted = [start, *explain(start.setting, replay.error, replay.candidates, 0.0, dear=True)][-1].setting
     trained = contract.delay_s if trained_delay_s is None else trained_delay_s
     age_s = 0.0 if log.rows_are_steps or log.age_s is None else float(np.median(log.age_s))
-    nominal = Plant().having("delay_s", max(0.0, (trained or 0.0) - age_s))
-    delay_s, base, best = fitted.number("delay_s", 0.0) + age_s, replay.error(nominal), replay.error(fitted)
-    numbers, low = dict(fitted.numbers), replay.limited(fitted)
-    # What may be a fault: its name, sentence, numbers, value, and share of the error without it.
+    nominal = Setting().having({"delay_s": max(0.0, (trained or 0.0) - age_s)})
+    delay_s, base, best = fitted.get("delay_s", 0.0) + age_s, replay.error(nominal), replay.error(fitted)
+    # What may be a fault: its names in the setting, fault, sentence, value, and share of the error without it.
     suspects = [
-        (part.dial.fault, part.dial.says(name)(fitted), [name], numbers[name], 0.07 if name == "kp" else 0.2)
-        for name, part in {**_PARTS, **{f"kp {j}": _of_one(j) for j in drives.joints}}.items()
-        if name in numbers and part.is_off(numbers[name])
-    ]
-    if low:
-        text, names = f"torque is clipped: {shortened(list(low.values()))}", [f"limit {j}" for j in low]
-        suspects.append(("torque limit", text, names, min(numbers[n] for n in names), 0.17))
+        ([name], part.fault, own.says(fitted), fitted.get(name), part.drop)
+        for part in _PARTS.values() if part.of != "some"
+        for own in map(part.of_joint, ("", *drives.joints))
+        for name in own.names if name in fitted and part.is_off(fitted.get(name))
+    ]  # fmt: skip
+    if low := replay.limited(fitted):
+        names, part = [f"limit {j}" for j in low], _PARTS["limit"]
+        text = str(part.text).format(value=shortened(list(low.values())))
+        suspects.append((names, part.fault, text, min(fitted.get(n) for n in names), part.drop))
     if delay_s - (0.010 if trained is None else trained) > _LATER_S:
         of_training = "none that is known" if trained is None else f"{1e3 * trained:.0f} ms"
         text = f"motion follows a target after {1e3 * delay_s:.0f} ms; the training had {of_training}"
-        suspects.append(("delay", text, ["delay_s"], delay_s, 0.07))
-    findings = []
-    for fault, text, names, value, least in suspects:
+        suspects.append((["delay_s"], "delay", text, delay_s, 0.07))
+    for names, fault, text, value, least in suspects:
         # The others are estimated again without it.
-        rest = Plant(tuple((n, v) for n, v in fitted.numbers if n not in names))
-        moves = [_NUISANCE[1], *([_PARTS["kp"].dial.move("kp")] if "kp" in dict(rest.numbers) else [])]
-        if names == ["delay_s"]:
-            rest = rest.having("delay_s", nominal.number("delay_s", 0.0))
+        rest = Setting(tuple((n, v) for n, v in fitted.values if n not in names))
+        moves = [*([_PARTS["kd"].move] if names != ["kd"] else []), *([_PARTS["kp"].move] if "kp" in rest else [])]
+        if fault == "delay":
+            rest = rest.having({"delay_s": nominal.get("delay_s")})
         else:
-            moves.append(_NUISANCE[0])
+            moves.append(_DELAY.move)
         gap = replay.error(rest) - best
         rest = replace(start, setting=rest, moves=moves).descended(replay.error).setting
-        joints = [i for i, j in enumerate(drives.joints) if f"kp {j}" in names] or list(range(len(drives.joints)))
-        without, with_it = (float(replay.errors(p)[joints].mean()) for p in (rest, fitted))
+        joints = [i for i, j in enumerate(drives.joints) if names[0].endswith(f" {j}") and fault != "torque limit"]
+        without, with_it = (float(replay.errors(p)[joints or slice(None)].mean()) for p in (rest, fitted))
         if with_it <= (1.0 - least) * without:
             share = float(np.clip(gap / max(base - best, gap, 1e-9), 0.0, 1.0))
             question = "timing" if fault == "delay" else "plant"
             findings.append(Finding(fault, question, text, share, {names[0].split()[0]: float(value)}))
-    nominal = nominal.having("delay_s", fitted.number("delay_s", 0.0))
+    nominal = nominal.having({"delay_s": fitted.get("delay_s", 0.0)})
     figures = {
         "error": base, "error_fitted": best, "delay_s": delay_s,
-        **{n: fitted.number(n, part.usual) for n, part in _PARTS.items()}, "kd": fitted.number("kd"),
+        **{n: fitted.get(n, part.usual) for n, part in _PARTS.items() if part.of not in ("one", "some")},
         "joints": {j: [float(a), float(b)] for j, a, b in
                    zip(contract.joints, replay.errors(nominal), replay.errors(fitted), strict=True)},
         "sag_rad": dict(zip(contract.joints, replay.sag(nominal).tolist(), strict=True)),
@@ -424,34 +470,64 @@ def solve_plant(
     return findings, figures
 
 
-def parting(replay: Replay, plant: Plant, joints: Sequence[str]) -> dict[str, Any]:
-    """Return the first window in which the fitted model leaves the robot, its worst joint, and both ways."""
+def _with_signs(drives: Drives, log: Log) -> tuple[list[Finding], Replay, Candidate]:
+    """Return the replay and its delay, with the joints turned that the log has with the other sign."""
+
+    def started(log: Log) -> tuple[Replay, Candidate]:
+        replay = Replay(drives, log)
+        best = min(_DELAY.candidates(Setting(), *_NUISANCE), key=lambda c: replay.error(c.setting))
+        return replay, best.descended(replay.error)
+
+    findings = list[Finding]()
+    replay, start = started(log)
+    for i in np.argsort(-replay.errors(start.setting)):
+        if replay.errors(start.setting)[i] < 0.5:
+            break
+        sign = np.where(np.arange(len(drives.joints)) == i, -1.0, 1.0)
+        turned, again = started(replace(replay.log, q=replay.log.q * sign, dq=replay.log.dq * sign))
+        before, after = replay.error(start.setting), turned.error(again.setting)
+        if after < 0.6 * before:
+            text = f"{drives.joints[i]} is measured with the other sign than in the model"
+            findings.append(Finding("sign", "plant", text, (before - after) / before))
+            replay, start = turned, again
+    return findings, replay, start
+
+
+def parting(replay: Replay, plant: Setting, joints: Sequence[str]) -> dict[str, Any]:
+    """Return the first window in which the fitted model leaves the robot, its worst joint, and both from there on."""
     error = np.abs(replay.residuals(plant)).mean(1)
     limit = max(4.0 * float(np.median(error)), 0.3)
     worse = np.flatnonzero(error.max(1) > limit)
     first = int(worse[0]) if len(worse) else int(np.argmax(error.max(1)))
     joint = int(np.argmax(error[first]))
-    d, used = replay.drives, replay.used[first]
-    state = replay.rolled(plant)[first]
-    simulated, measured = state[:, 1 + d.qpos], replay.measured[first]
-    poses = []
-    for row in np.flatnonzero(used)[np.linspace(0, used.sum() - 1, 5).astype(int)]:
-        qpos = state[row, 1 : 1 + d.model.nq]
-        robot = qpos.copy()
-        robot[d.qpos] = measured[row]
-        poses.append([drawn(d.model, robot), drawn(d.model, qpos)])
+    d, log, h = replay.drives, replay.log, replay.drives.model.opt.timestep
+    begin = float(log.state_t[replay.starts[first]])
+    times = begin + np.arange(0.0, min(_FILM_S, log.state_t[-1] - begin - h), h)
+    states = replay.rolled(plant, replay.initial[[first]], times[None])[0]
+    shown = np.linspace(0, len(times) - 1, _FRAMES).astype(int)
+    measured = np.stack([np.interp(times[shown] + h, log.state_t, q) for q in log.q.T], -1)
+    simulated = states[shown, 1 : 1 + d.model.nq]
+    robot = simulated.copy()
+    robot[:, d.qpos] = measured
+    if d.free:  # where the base was is not measured
+        robot[:, :3] = simulated[0, :3]
+        if log.quat is not None:
+            robot[:, 3:7] = log.quat[np.searchsorted(log.state_t, times[shown] + h).clip(0, len(log.quat) - 1)]
     return {
-        "time_s": float(replay.log.state_t[replay.starts[first]]), "joint": joints[joint], "apart": bool(len(worse)),
-        "error": float(error[first, joint]), "t": (replay.step_t[used] + d.model.opt.timestep).tolist(),
-        "measured": measured[used, joint].tolist(), "simulated": simulated[used, joint].tolist(), "poses": poses,
+        "time_s": begin, "joint": joints[joint], "apart": bool(len(worse)), "error": float(error[first, joint]),
+        "t": (times[shown] + h - begin).tolist(),
+        "measured": measured[:, joint].tolist(), "simulated": simulated[:, d.qpos[joint]].tolist(),
+        "film": {"measured": drawn(d.model, robot), "simulated": drawn(d.model, simulated)},
     }  # fmt: skip
 
 
-def drawn(model: Any, qpos: np.ndarray) -> list[list[list[float]]]:
-    """Return a line of points (x, y, z) for each body: from its parent's origin to its own, and to its centre."""
-    data = mujoco.MjData(model)
-    data.qpos[:] = qpos
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
+def drawn(model: Any, qpos: np.ndarray) -> list[Any]:
+    """Return a line of points (x, y, z) for each pose ``(T, nq)`` and body: its parent, itself, and its centre."""
+    data, frames = mujoco.MjData(model), []
     parents = np.where(model.body_parentid == 0, np.arange(model.nbody), model.body_parentid)
-    return np.round(np.stack([data.xpos[parents], data.xpos, data.xipos], 1)[1:], 4).tolist()
+    for pose in qpos:
+        data.qpos[:] = pose
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        frames.append(np.round(np.stack([data.xpos[parents], data.xpos, data.xipos], 1)[1:], 4).tolist())
+    return frames

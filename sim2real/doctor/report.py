@@ -15,6 +15,7 @@ from sim2real.view.page import write_page
 from sim2real.view.style import BLUE, INK, ORANGE, PHONE_IN, ROLES, new_figure, styled, to_svg
 
 PAGE = "doctor.html"
+_PANEL, _SLOWER = 260.0, 4.0
 _LOOKS = {"measured": ROLES["measured"], "simulated": ROLES["identified"]}
 _QUESTIONS = {
     "contract": ("Contract", "Does the network see and move what it was trained with?"),
@@ -45,7 +46,7 @@ def write_diagnosis(folder: Path, diagnosis: Diagnosis, log: Log, name: str) -> 
             rows = [[j, number(a), number(b), number(1e3 * sag[j])] for j, (a, b) in figures["joints"].items()]
             names = ("joint", "error of the model", "with what was found", "beside the model after 0.2 s [mrad]")
             blocks.append(TableBlock("By joint; errors are shares of its motion", names, rows))
-            blocks += [_parting(figures["parting"]), _poses(figures["parting"])]
+            blocks += [_parting(figures["parting"]), _film(figures["parting"])]
             if own:
                 what = ", ".join(sorted({n for f in own for n in f.numbers})) or "the delay"
                 blocks.append(ListBlock("Next", [
@@ -104,20 +105,35 @@ def _parting(at: Mapping[str, Any]) -> FigureBlock:
     return _figure(draw, "parting", f"{word}: {at['time_s']:.2f} s, {at['joint']}.")
 
 
-def _poses(at: Mapping[str, Any]) -> FigureBlock:
-    """Draw the bodies of robot and model from one side, at some moments of a window, beside each other."""
+def _film(at: Mapping[str, Any]) -> FigureBlock:
+    """Draw the bodies of robot and model beside each other, moving from the moment at which they part.
 
-    def draw(axis: Any) -> None:
-        points = np.array(at["poses"])  # moment, robot or model, body, point, coordinate
-        wide = int(np.ptp(points[..., 1]) > np.ptp(points[..., 0]))  # the side from which more is seen
-        step = 1.3 * max(np.ptp(points[..., wide]), 0.3 * np.ptp(points[..., 2]))
-        for k, moment in enumerate(points):
-            for bodies, (name, look) in zip(moment, _LOOKS.items(), strict=True):
-                x, z = bodies[..., wide].T + k * step, bodies[..., 2].T
-                lines = axis.plot(x, z, color=look.color, linestyle=look.dash)
-                lines[0].set_label(name if k == 0 else None)
-        axis.set_aspect("equal", "datalim")
-        axis.set_axis_off()
-        axis.legend()
+    The drawing moves by itself, without a script, which the page forbids.
+    """
+    both = np.array([at["film"][name] for name in _LOOKS])  # robot or model, moment, body, point, coordinate
+    side = int(np.ptp(both[..., 1]) > np.ptp(both[..., 0]))  # the side from which more is seen
+    flat = both[..., [side, 2]] * [1.0, -1.0]
+    low = flat.min((0, 1, 2, 3))
+    size = np.maximum(flat.max((0, 1, 2, 3)) - low, 0.3 * max(np.ptp(flat[..., 0]), np.ptp(flat[..., 1])))
+    flat = (flat - low) * (_PANEL - 40.0) / size.max() + 20.0
 
-    return _figure(draw, "poses", f"Robot and model in the {1e3 * (at['t'][-1] - at['t'][0]):.0f} ms from there on.")
+    def moving(points: np.ndarray, look: Any, width: float) -> str:
+        paths = ["".join("M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in body) for body in bodies) for bodies in points]
+        color = f"var(--{'ink' if look.color == INK else 'blue'}, {look.color})"
+        frames = f'<animate attributeName="d" {repeated} values="{";".join(paths)}"/>'
+        return f'<path fill="none" stroke="{color}" stroke-width="{width}" d="{paths[0]}">{frames}</path>'
+
+    repeated = f'dur="{_SLOWER * at["t"][-1]:.1f}s" repeatCount="indefinite"'
+    robot, model = _LOOKS.values()
+    panels = {"robot": moving(flat[0], robot, 4.0),
+              "model; thin: the robot": moving(flat[1], model, 4.0) + moving(flat[0], robot, 1.0)}  # fmt: skip
+    shown = "".join(f'<g transform="translate({k * _PANEL:.0f} 18)"><text x="20">{name}</text>{lines}</g>'
+                    for k, (name, lines) in enumerate(panels.items()))  # fmt: skip
+    wide, high = 2 * _PANEL, float(flat[..., 1].max()) + 40.0
+    clock = f'<animate attributeName="width" {repeated} from="0" to="{wide - 40:.0f}"/>'
+    clock = f'<rect x="20" y="{high:.0f}" height="3" width="0" fill="var(--muted, gray)">{clock}</rect>'
+    end_s = at["time_s"] + at["t"][-1]
+    caption = f"Robot and model under the same commands from {at['time_s']:.2f} s to {end_s:.2f} s, in slow motion."
+    size = f'width="{72 * PHONE_IN:.0f}pt" viewBox="0 0 {wide:.0f} {high + 10:.0f}"'
+    svg = f'<svg role="img" aria-label="{caption}" {size} font-size="12" fill="var(--ink, black)">{shown}{clock}</svg>'
+    return FigureBlock(svg, caption)

@@ -1,10 +1,10 @@
-"""The search for what is wrong: candidates change a setting, and those stay that explain most of an error."""
+"""The search for what is wrong: suspects change a setting, and those stay that explain most of an error."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Generic, Self, TypeVar
+from typing import Any
 
 _MOST, _HEADS, _SWEEPS = 4, 6, 4
 
@@ -30,40 +30,42 @@ class Finding:
 
 @dataclass(frozen=True)
 class Setting:
-    """What a deployment is like; ``numbers``: name -> value, of those that differ from what was agreed."""
+    """What a deployment is like: name -> value, of what differs from what was agreed."""
 
-    numbers: tuple[tuple[str, float], ...] = ()
+    values: tuple[tuple[str, Any], ...] = ()
 
-    def number(self, name: str, usual: float = 1.0) -> float:
+    def get(self, name: str, usual: Any = 1.0) -> Any:
         """Return the value of a name."""
-        return dict(self.numbers).get(name, usual)
+        return dict(self.values).get(name, usual)
 
-    def having(self, name: str, value: float) -> Self:
-        """Return the setting with another value of a name."""
-        return replace(self, numbers=tuple(sorted((dict(self.numbers) | {name: value}).items())))
+    def having(self, values: Mapping[str, Any]) -> Setting:
+        """Return the setting with other values of some names."""
+        return Setting(tuple(sorted((dict(self.values) | dict(values)).items())))
+
+    def __contains__(self, name: str) -> bool:
+        return name in dict(self.values)
 
 
-S = TypeVar("S", bound=Setting)
+Move = Callable[[Setting], Iterable[Setting]]
 
 
 @dataclass(frozen=True)
-class Candidate(Generic[S]):
-    """One thing that may be wrong.
+class Candidate:
+    """A setting with one thing wrong, beside what is known already.
 
     Attributes:
-        setting: What a deployment with it is like.
         text: Returns the sentence about a setting.
         moves: Each returns settings near one, which differ in one way.
         least: Share of the error by which it must lower it.
     """
 
     fault: str
-    setting: S
-    text: Callable[[S], str]
-    moves: Sequence[Callable[[S], Iterable[S]]] = ()
+    setting: Setting
+    text: Callable[[Setting], str]
+    moves: Sequence[Move] = ()
     least: float = 0.12
 
-    def descended(self, error: Callable[[S], float]) -> Candidate[S]:
+    def descended(self, error: Callable[[Setting], float]) -> Candidate:
         """Return the candidate with the best setting near its own, one way after the other."""
         best = self.setting
         for _ in range(_SWEEPS):
@@ -76,44 +78,51 @@ class Candidate(Generic[S]):
 
 
 @dataclass(frozen=True)
-class Dial:
-    """A number that may be wrong.
+class Suspect:
+    """One thing that may be wrong: names of a setting, all of which get one of some values.
 
     Attributes:
-        text: A sentence with ``name``, ``value`` and ``ms``.
+        text: A sentence with ``value`` and ``ms``, or a function of the value.
         grid: The values that are tried first.
         near: Returns those near a value.
         least: As of a candidate.
     """
 
     fault: str
-    text: str
-    grid: Sequence[float]
-    near: Callable[[float], Iterable[float]] = lambda _: ()
+    names: tuple[str, ...]
+    text: str | Callable[[Any], str]
+    grid: Sequence[Any]
+    near: Callable[[Any], Iterable[Any]] = lambda _: ()
     least: float = 0.12
 
-    def move(self, name: str) -> Callable[[S], Iterable[S]]:
-        """Return what gives settings near one."""
-        return lambda at: [at.having(name, float(v)) for v in self.near(at.number(name, self.grid[0]))]
+    def move(self, at: Setting) -> Iterable[Setting]:
+        """Return settings near one."""
+        value = at.get(self.names[0], self.grid[0])
+        return [at.having(dict.fromkeys(self.names, v)) for v in self.near(value)]
 
-    def candidates(self, setting: S, name: str, more: Sequence[Callable[[S], Iterable[S]]] = ()) -> list[Candidate[S]]:
+    def candidates(self, start: Setting, *more: Move) -> list[Candidate]:
         """Return a candidate for each value of the grid; ``more``: further moves."""
-        moves = [self.move(name), *more]
-        return [Candidate(self.fault, setting.having(name, float(v)), self.says(name), moves, self.least)
+        moves = (self.move, *more)
+        return [Candidate(self.fault, start.having(dict.fromkeys(self.names, v)), self.says, moves, self.least)
                 for v in self.grid]  # fmt: skip
 
-    def says(self, name: str) -> Callable[[Setting], str]:
-        """Return what gives the sentence about a setting."""
-        return lambda at: self.text.format(name=name, value=at.number(name), ms=1e3 * at.number(name))
+    def says(self, at: Setting) -> str:
+        """Return the sentence about a setting."""
+        value = at.get(self.names[0])
+        return self.text(value) if callable(self.text) else self.text.format(value=value, ms=_milli(value))
+
+
+def _milli(value: Any) -> float:
+    return 1e3 * value if isinstance(value, float) else 0.0
 
 
 def explain(
-    start: S,
-    error: Callable[[S], float],
-    candidates: Callable[[S], Iterable[Candidate[S]]],
+    start: Setting,
+    error: Callable[[Setting], float],
+    candidates: Callable[[Setting], Iterable[Candidate]],
     sound: float,
     dear: bool = False,
-) -> list[Candidate[S]]:
+) -> list[Candidate]:
     """Return the candidates that explain an error, the greatest first; each setting has those before it.
 
     Args:
@@ -123,7 +132,7 @@ def explain(
         dear: Whether an error takes long: fewer candidates are followed, and two that explain only together are missed.
     """
 
-    def ranked(setting: S) -> list[Candidate[S]]:
+    def ranked(setting: Setting) -> list[Candidate]:
         """Return the candidates in their order; the best of all and of each fault have the best setting near theirs."""
         found = sorted(candidates(setting), key=lambda c: error(c.setting))
         of_faults = list({c.fault: i for i, c in reversed(list(enumerate(found)))}.values())
@@ -131,7 +140,7 @@ def explain(
             found[i] = found[i].descended(error)
         return sorted(found, key=lambda c: error(c.setting))
 
-    chosen: list[Candidate[S]] = []
+    chosen: list[Candidate] = []
     while (before := error(start)) > sound and len(chosen) < _MOST:
         found = ranked(start)
         clear = [c for c in found if before - error(c.setting) >= max(c.least * before, 0.4 * sound)]

@@ -12,32 +12,21 @@ import numpy as np
 from scipy.optimize import least_squares, linear_sum_assignment
 
 from sim2real.doctor.contract import Policy
-from sim2real.doctor.deployed import FRAMES, Deployed, Making, known
+from sim2real.doctor.deployed import FRAMES, Deployed, known
 from sim2real.doctor.log import Log
-from sim2real.doctor.search import Candidate, Dial, Finding, explain, shortened
+from sim2real.doctor.search import Candidate, Finding, Setting, Suspect, explain, shortened
 
 _SOUND, _FINE = 0.01, 0.0015
 """Mean errors below this share of the signal's deviation are none: rounding, and samples a few milliseconds apart;
 in a logged observation one term of many may be wrong."""
 _LATE_S = 0.012
 """Measurements that are older than the log's newest by less are no fault."""
-_SIDES = {"the observation": ("seen",), "the targets": ("moved",), "observation and targets": ("seen", "moved")}
+_PLACES = {"the observation": ("seen",), "the targets": ("moved",), "observation and targets": ("seen", "moved")}
 _LEFT_AND_RIGHT = ("fl fr", "rl rr", "lf rf", "lh rh", "hl hr", "bl br", "lb rb", "left right", "l r")
+_FACTORS = (1 / 57.3, 0.05, 0.1, 0.2, 0.25, 0.5, 2.0, 4.0, 5.0, 10.0, 20.0, 57.3)
 _STEPS = np.array((0.6, 0.75, 0.87, 0.95, 0.99, 1.01, 1.05, 1.15, 1.33, 1.67))
-_SCALE = Dial(
-    "scale", "{name} has {value:.3g} times the contract's scale",
-    (1 / 57.3, 0.05, 0.1, 0.2, 0.25, 0.5, 2.0, 4.0, 5.0, 10.0, 20.0, 57.3), lambda factor: factor * _STEPS,
-)  # fmt: skip
-_DIALS = {
-    "reversed": Dial("history reversed", "the history is in the reversed order", (1.0,)),
-    "normalised": Dial("normaliser", "the normaliser is applied {value:.0f} times", (0.0, 2.0)),
-    "frozen": Dial("frozen imu", "gyro and gravity in the observation do not change any more",
-                   np.arange(0.0, 0.95, 0.05).tolist(),
-                   lambda share: np.clip(share + np.arange(-0.05, 0.051, 0.005), 0.0, 0.99)),
-    "late": Dial("delay", "the policy sees measurements that are {ms:.0f} ms older than the log's newest",
-                 (0.01, 0.02, 0.03, 0.04, 0.06),
-                 lambda late_s: np.maximum(late_s + np.arange(-0.008, 0.009, 0.002), 1e-4)),
-}  # fmt: skip
+_AXES = [tuple(s * i for s, i in zip(signs, order, strict=True)) for order in itertools.permutations((1, 2, 3))
+         for signs in itertools.product((1, -1), repeat=3)][1:]  # fmt: skip
 
 
 class Link:
@@ -52,54 +41,60 @@ class Link:
 
     def __init__(self, deployed: Deployed, name: str, robot_joints: Sequence[str]) -> None:
         self.d, self.name, self.robot_joints = deployed, name, robot_joints
-        self._errors: dict[Making, float] = {}
+        self._errors: dict[Setting, float] = {}
         self._sees = name in ("observation", "network")
         # Without logged actions, the targets are a part of the question about the network.
         lacks = deployed.log.action is None and deployed.log.target is not None
-        self._acts = name == "target" or (name == "network" and lacks)
-        there = ["seen"] * self._sees + ["moved"] * self._acts
-        self._places = [place for place, sides in _SIDES.items() if set(sides) <= set(there)]
+        self._moves = name == "target" or (name == "network" and lacks)
+        there = ["seen"] * self._sees + ["moved"] * self._moves
+        self._places = [place for place, sides in _PLACES.items() if set(sides) <= set(there)]
 
-    def predicted(self, how: Making, given: np.ndarray | None = None) -> np.ndarray:
+    def wanted(self, how: Setting) -> np.ndarray:
+        """Return what was logged at the end of the link at all steps ``(N, outputs)``."""
+        return known({"target": self.d.log.target, "observation": self.d.logged}.get(self.name, self.d.actions(how)))
+
+    def given(self, how: Setting) -> np.ndarray:
+        """Return the observations ``(R, O)``."""
+        d, rows = self.d, np.maximum(self.d.rows - how.get("stale", 0), 0)
+        return known(d.logged)[rows] if self.name == "normaliser" else d.observations(how, rows)
+
+    def predicted(self, how: Setting, given: np.ndarray | None = None) -> np.ndarray:
         """Return what a deployment would have logged at the end of the link ``(R, outputs)``.
 
         Args:
             given: What the network is given, before gain and bias, if it is known already.
         """
-        d, rows = self.d, self.d.rows
+        d = self.d
         if self.name == "target":
-            return d.targets(how, d.acted[rows])
+            return d.targets(how, d.acted[d.rows])
         x = self.given(how) if given is None else given
         if self.name == "observation":
             return x
-        x = x * how.gain + how.bias if how.gain else x
-        for _ in range(int(how.number("normalised"))):
+        x = x * how.get("gain") + how.get("bias", 0.0)
+        for _ in range(int(how.get("normalised"))):
             x = d.policy.normalised(x)
         return d.policy.network(x)
 
-    def given(self, how: Making) -> np.ndarray:
-        """Return the observations ``(R, O)``."""
-        return known(self.d.logged)[self.d.rows] if self.name == "normaliser" else self.d.observations(how, self.d.rows)
-
-    def residuals(self, how: Making, given: np.ndarray | None = None) -> np.ndarray:
+    def residuals(self, how: Setting, given: np.ndarray | None = None) -> np.ndarray:
         """Return the differences from what was logged ``(R, outputs)``, in units of its deviation."""
-        d = self.d
-        logged = {"target": d.log.target, "observation": d.logged}.get(self.name, d.actions(how))
-        wanted = known(logged)[d.rows]
+        all_rows = self.wanted(how)
+        wanted, predicted = all_rows[self.d.rows], self.predicted(how, given)
+        if how.get("clipped", False):
+            predicted = np.clip(predicted, all_rows.min(0), all_rows.max(0))
         each = wanted.std(0)
-        return (self.predicted(how, given) - wanted) / np.maximum(each, 0.2 * np.median(each) + 1e-4)
+        return (predicted - wanted) / np.maximum(each, 0.2 * np.median(each) + 1e-4)
 
-    def error(self, how: Making) -> float:
+    def error(self, how: Setting) -> float:
         """Return the mean error, each part of which counts as at most 1.5."""
         if how not in self._errors:
             self._errors[how] = float(np.minimum(np.abs(self.residuals(how)), 1.5).mean())
         return self._errors[how]
 
-    def solve(self) -> list[Candidate[Making]]:
+    def solve(self) -> list[Candidate]:
         """Return what is wrong, the greatest first."""
-        if (before := self.error(Making())) < (sound := _FINE if self.name == "observation" else _SOUND):
+        if (before := self.error(Setting())) < (sound := _FINE if self.name == "observation" else _SOUND):
             return []
-        chosen = [] if self.name == "normaliser" else explain(Making(), self.error, self.candidates, sound)
+        chosen = explain(Setting(), self.error, self.candidates, sound)
         error = self.error(chosen[-1].setting) if chosen else before
         clear = error < 0.1 * before
         if self.name not in ("network", "normaliser") or error < _SOUND or (clear and len(chosen) < 2):
@@ -107,102 +102,128 @@ class Link:
         # Another normaliser, if it explains more: alone, or beside what leaves much unexplained.
         tried = []
         for count in sorted({0} if clear else {0, min(1, len(chosen)), len(chosen)}):
-            made = self._normaliser(chosen[count - 1].setting if count else Making())
-            tried.append([*chosen[:count], Candidate("normaliser", made, _says("the observation is normalised with "
-                                                                              "other numbers"))])  # fmt: skip
-        best = min(tried, key=lambda c: self.error(c[-1].setting) * (1 + 0.1 * len(c)))
+            made = self._normaliser(chosen[count - 1].setting if count else Setting())
+            text = "the observation is normalised with other numbers"
+            tried.append([*chosen[:count], Candidate("normaliser", made, lambda _, text=text: text)])
+        alone = [c for c in tried if self.error(c[-1].setting) < _SOUND][:1]
+        best = min(alone or tried, key=lambda c: self.error(c[-1].setting) * (1 + 0.1 * len(c)))
         # Two free numbers for each entry halve many an error: they must explain three quarters of it.
         return best if self.error(best[-1].setting) < (_SOUND if clear else min(0.5 * error, 0.25 * before)) else chosen
 
-    def _normaliser(self, how: Making) -> Making:
-        """Return a making with the gain and the bias of each entry of the observation that fit best."""
+    def _normaliser(self, how: Setting) -> Setting:
+        """Return a way with the gain and the bias of each entry of the observation that fit best."""
         given = self.given(how)
         size, unit = given.shape[1], np.maximum(given.std(0), 1e-3)
 
-        def made(theta: np.ndarray) -> Making:
-            return replace(how, gain=tuple(1 + theta[:size]), bias=tuple(theta[size:] * unit))
+        def made(theta: np.ndarray) -> Setting:
+            return how.having({"gain": tuple(1 + theta[:size]), "bias": tuple(theta[size:] * unit)})
 
         pulled = lambda theta: np.append(self.residuals(made(theta), given), 0.01 * theta)  # noqa: E731
         return made(_fitted(pulled, 2 * size, 1e-2, 1.0))
 
-    # -- candidates
+    # -- suspects
 
-    def candidates(self, how: Making) -> Iterator[Candidate[Making]]:
+    def candidates(self, how: Setting) -> Iterator[Candidate]:
         """Return what may be wrong beside what is known already."""
-        d = self.d
+        for suspect in self._suspects(how):
+            if not any(name in how for name in suspect.names):
+                yield from suspect.candidates(how)
         for place in self._places:
             yield from self._of_joints(how, place)
-        yield from (c for name, dial in self._dials() if name not in dict(how.numbers)
-                    for c in dial.candidates(how, name))  # fmt: skip
-        for kind in [k for k in ("ang_vel", "gravity", "lin_vel") if self._sees and k in d.made]:
-            if kind in dict(how.vectors):
-                continue
-            turned = lambda change, kind=kind: replace(how, vectors=(*how.vectors, (kind, change)))  # noqa: E731
-            for frame, text in FRAMES.items() if d.log.quat is not None else ():
-                fault = "gyro rotated twice" if (frame, kind) == ("twice", "ang_vel") else "world frame"
-                yield Candidate(fault, turned(frame), _says(f"{kind} is {text}"))
-            for signs in itertools.product((1.0, -1.0), repeat=3):
-                if min(signs) < 0:
-                    yield Candidate("sign", turned(signs), _says(f"{kind} has other signs: {signs}"))
 
-    def _dials(self) -> Iterator[tuple[str, Dial]]:
-        d = self.d
-        if self._acts:
-            yield "action_scale", _SCALE
-        if not self._sees:
-            return
-        yield from ((kind, _SCALE) for kind in sorted(d.made))
-        period_s = float(np.median(np.diff(d.log.t)))
-        yield "late", replace(_DIALS["late"], grid=sorted({*_DIALS["late"].grid, period_s, 2 * period_s}))
-        for name, there in (("frozen", {"ang_vel", "gravity"} & d.made), ("reversed", d.history > 1),
-                            ("normalised", d.contract.mean and self.name == "network")):  # fmt: skip
-            if there:
-                yield name, _DIALS[name]
+    def _suspects(self, how: Setting) -> Iterator[Suspect]:
+        """Return all suspects but those of single joints."""
+        d, c, sees = self.d, self.d.contract, self._sees
+        shares = np.arange(0.0, 0.95, 0.01).tolist()
+        period_s, imu = float(np.median(np.diff(d.log.t))), {"ang_vel", "gravity"} & d.made
+        for kind in [*(sorted(d.made) if sees else ()), *(["action_scale"] if self._moves else ())]:
+            text = f"{kind} has {{value:.3g}} times the contract's scale"
+            yield Suspect("scale", (kind,), text, _FACTORS, lambda factor: factor * _STEPS)
+        for kind in sorted(d.made) if sees else ():
+            yield Suspect("missing term", (kind,), f"{kind} is 0 in the observation", (0.0,))
+        for kind in ("joint_pos", "joint_vel") if sees else ():
+            yield Suspect("scale", (f"degrees {kind}",), f"{kind} is in degrees before the pose is taken off", (True,))
+        for kind in [k for k in ("ang_vel", "gravity", "lin_vel") if sees and k in d.made]:
+            for frame, (words, _) in FRAMES.items() if d.log.quat is not None else ():
+                fault = "quaternion order" if frame.startswith("w ") else "world frame"
+                fault = "gyro rotated twice" if (kind, frame) == ("ang_vel", "twice") else fault
+                yield Suspect(fault, (f"frame {kind}",), f"{kind} is {words}", (frame,))
+            for axes in _AXES:
+                fault = "sign" if np.abs(axes).tolist() == [1, 2, 3] else "axes"
+                yield Suspect(fault, (f"frame {kind}",), f"{kind} has the axes {axes}", (axes,))
+        if sees:
+            yield Suspect(
+                "delay", ("late",), "the policy sees measurements that are {ms:.0f} ms older than the log's newest",
+                sorted({0.01, 0.02, 0.03, 0.04, 0.06, period_s, 2 * period_s}),
+                lambda late_s: np.maximum(late_s + np.arange(-0.008, 0.009, 0.002), 1e-4))  # fmt: skip
+            yield Suspect(
+                "frozen joint", ("stuck",), lambda at: f"{c.joints[at[0]]} in the observation does not change any more",
+                [(i, share) for i in range(len(c.joints)) for share in shares[::5]],
+                lambda at: [(at[0], share) for share in _near_share(at[1])],
+            )  # fmt: skip
+        if sees and imu:
+            yield Suspect("frozen imu", ("frozen",), "gyro and gravity in the observation do not change any more",
+                          shares,
+                          _near_share)  # fmt: skip
+        if sees and d.history > 1:
+            yield Suspect("history reversed", ("history",), "the history is in the reversed order", ("reversed",))
+            text = "the history is by step and not by term, or the reverse"
+            yield Suspect("history order", ("history",), text, ("layout",))
+            text = "the history has the newest values in all its places"
+            yield Suspect("history order", ("history",), text, ("newest",))
+        if sees and "last_action" in d.made:
+            text = "last_action is the action of one step more before"
+            yield Suspect("last action", ("last_action is",), text, ("older",))
+            yield Suspect("last action", ("last_action is",), "last_action is the target made of it", ("target",))
+        if sees and len(c.observation) < 10:
+            exchanged = lambda order: [tuple(o) for o in _exchanges(order)]  # noqa: E731
+            text = lambda order: f"the terms come as {', '.join(c.observation[i].term for i in order)}"  # noqa: E731
+            yield Suspect("term order", ("terms",), text, exchanged(range(len(c.observation))), exchanged)
+        if self.name != "target":
+            yield Suspect("delay", ("stale",), "the network answers the observation of {value} steps before", (1, 2))
+        if self.name in ("network", "normaliser") and c.mean:
+            yield Suspect("normaliser", ("normalised",), "the normaliser is applied {value:.0f} times", (0.0, 2.0))
+        wanted = self.wanted(how)
+        if self.name != "observation" and ((wanted == wanted.max(0)) | (wanted == wanted.min(0))).mean(0).max() > 0.03:
+            text = "actions are clipped, where the contract has no limits"
+            yield Suspect("action clipped", ("clipped",), text, (True,))
 
-    def _of_joints(self, how: Making, place: str) -> Iterator[Candidate[Making]]:
+    def _of_joints(self, how: Setting, place: str) -> Iterator[Candidate]:
         """Return other orders, signs and poses of the joints in a place."""
-        joints, sides = self.d.contract.joints, [getattr(how, side) for side in _SIDES[place]]
-        if len(joints) > 1 and not any(side.order for side in sides):
+        joints, sides = self.d.contract.joints, _PLACES[place]
+        names = lambda what: tuple(f"{what} {side}" for side in sides)  # noqa: E731
+        if len(joints) > 1 and not any(name in how for name in names("order")):
             same, mirror = tuple(range(len(joints))), mirror_of(joints)
-            moves = [lambda at: self._exchanged(at, place)] if self.name == "network" else []
-            for order in dict.fromkeys(tuple(int(i) for i in order) for order in self._orders(how)):
-                if order != same:
-                    fault = "left and right" if order == mirror else "joint order"
-                    yield Candidate(fault, _changed(how, place, order=order), self._order_text(place), moves)
+            found = dict.fromkeys(tuple(int(i) for i in order) for order in self._orders(how))
+            near = lambda order: [tuple(o) for o in _exchanges(order) if tuple(o) != same]  # noqa: E731
+            for fault, orders in (("left and right", [o for o in found if o == mirror]),
+                                  ("joint order", [o for o in found if o not in (same, mirror)])):  # fmt: skip
+                text = lambda order: self._order_text(order, place)  # noqa: E731
+                suspect = Suspect(fault, names("order"), text, orders)
+                yield from (replace(suspect, near=near) if self.name == "network" else suspect).candidates(how)
         for i, joint in enumerate(joints):
-            signs = np.array(sides[0].signs or np.ones(len(joints)))
-            signs[i] *= -1.0
-            text = _says(f"{joint} has the other sign in {place}")
-            for whole in (False, True):
-                yield Candidate("sign", _changed(how, place, signs=tuple(signs.tolist()), whole=whole), text)
-        if any(side.offset for side in sides) or (place != "the targets" and "joint_pos" not in self.d.made):
+            text = f"{joint} has the other sign in {place}"
+            for what in ("signs", "turned"):
+                signs = np.array(how.get(names(what)[0], np.ones(len(joints))))
+                signs[i] *= -1.0
+                yield from Suspect("sign", names(what), text, [tuple(signs.tolist())]).candidates(how)
+        if any(name in how for name in names("pose")) or (self._sees and "joint_pos" not in self.d.made):
             return
-        moved = lambda shift: self.residuals(_changed(how, place, offset=tuple(shift.tolist()))).ravel()  # noqa: E731
-        offset = np.clip(_fitted(moved, len(joints), 0.02, 0.1), -2.0, 2.0)
+        moved = lambda shift: how.having(dict.fromkeys(names("pose"), tuple(shift.tolist())))  # noqa: E731
+        offset = np.clip(_fitted(lambda s: self.residuals(moved(s)).ravel(), len(joints), 0.02, 0.1), -2.0, 2.0)
         offset[np.abs(offset) < 0.01] = 0.0
         worst = int(np.argmax(np.abs(offset)))
         if abs(offset[worst]) >= 0.02:
             text = f"the default pose in {place} is another: by {offset[worst]:+.3f} rad at {joints[worst]}"
-            yield Candidate("default pose", _changed(how, place, offset=tuple(offset.tolist())), _says(text))
+            yield Candidate("default pose", moved(offset), lambda _: text)
 
-    def _order_text(self, place: str) -> Callable[[Making], str]:
-        joints, mirror = self.d.contract.joints, mirror_of(self.d.contract.joints)
+    def _order_text(self, order: Sequence[int], place: str) -> str:
+        joints = self.d.contract.joints
+        words = "left and right are exchanged" if order == mirror_of(joints) else "the joints are in another order"
+        moved = [f"{joints[j]} in place of {joints[i]}" for i, j in enumerate(order) if i != j]
+        return f"{words} in {place}: {shortened(moved)}"
 
-        def text(how: Making) -> str:
-            order = getattr(how, _SIDES[place][0]).order
-            words = "left and right are exchanged" if order == mirror else "the joints are in another order"
-            moved = [f"{joints[j]} in place of {joints[i]}" for i, j in enumerate(order) if i != j]
-            return f"{words} in {place}: {shortened(moved)}"
-
-        return text
-
-    def _exchanged(self, how: Making, place: str) -> Iterator[Making]:
-        """Return the makings with two joints exchanged, but for the contract's own order."""
-        for order in _exchanges(getattr(how, _SIDES[place][0]).order):
-            if order != sorted(order):
-                yield _changed(how, place, order=tuple(order))
-
-    def _orders(self, how: Making) -> Iterator[Any]:
+    def _orders(self, how: Setting) -> Iterator[Any]:
         """Return orders in which joints may come: matched to the log, mirrored, sorted, by type or leg, exchanged."""
         joints = self.d.contract.joints
         count = len(joints)
@@ -226,7 +247,7 @@ class Link:
         yield range(count - 1, -1, -1)
         yield from _exchanges(range(count))
 
-    def _matched(self, how: Making) -> Any:
+    def _matched(self, how: Setting) -> Any:
         """Return the order in which the logged columns fit the expected ones best."""
         d, rows = self.d, self.d.rows
         if self.name == "target":
@@ -235,13 +256,15 @@ class Link:
             cost, made = np.zeros((len(d.contract.joints),) * 2), d.quantities(how)
             for i, term in enumerate(d.contract.observation):
                 if term.kind in {"joint_pos", "joint_vel"} & d.made:
-                    lag = term.history - 1 if how.number("reversed", 0.0) else 0
+                    lag = term.history - 1 if how.get("history", "") == "reversed" else 0
                     cost += _distance(d.logged_block(i, lag)[rows], made[term.kind][rows])
         return linear_sum_assignment(cost)[1]
 
 
-def _says(text: str) -> Callable[[Making], str]:
-    return lambda _: text
+def _near_share(share: float) -> list[float]:
+    """Return shares near one, down to a step of the policy: the values of each step are others."""
+    moves = np.concatenate([np.arange(-0.06, 0.061, 0.0015), np.arange(-0.0015, 0.0015, 0.0003)])
+    return np.clip(share + moves, 0.0, 0.99).tolist()
 
 
 def _fitted(residuals: Callable[[np.ndarray], np.ndarray], size: int, step: float, outlier: float) -> np.ndarray:
@@ -253,11 +276,6 @@ def _fitted(residuals: Callable[[np.ndarray], np.ndarray], size: int, step: floa
 
     jac: Any = slopes  # the stubs know names of methods only
     return least_squares(residuals, np.zeros(size), jac, loss="huber", f_scale=outlier, ftol=1e-3, max_nfev=10).x
-
-
-def _changed(how: Making, place: str, **changes: Any) -> Making:
-    """Return a making with other joints in the observation, the targets, or both."""
-    return replace(how, **{side: replace(getattr(how, side), **changes) for side in _SIDES[place]})
 
 
 def _exchanges(order: Sequence[int]) -> Iterator[list[int]]:
@@ -292,7 +310,7 @@ def solve_contract(
 ) -> tuple[list[Finding], dict[str, float]]:
     """Return what is wrong between measurements, observations, actions and targets, and the error of each link."""
     deployed, errors = Deployed(log, policy), dict[str, float]()
-    findings = frozen_sensors(log)
+    findings = frozen_sensors(log, policy.contract.joints)
     has_obs, has_action, has_target = log.obs is not None, log.action is not None, log.target is not None
     links = ["observation" if has_obs else "network"]
     links += ["normaliser"] if has_obs and has_action else []
@@ -302,16 +320,15 @@ def solve_contract(
             continue
         link = Link(deployed, name, robot_joints)
         chosen = link.solve()
-        steps = [link.error(c.setting) for c in (Candidate("", Making(), _says("")), *chosen)]
+        steps = [link.error(Setting()), *(link.error(c.setting) for c in chosen)]
         errors[name], errors[f"{name}_after"] = steps[0], steps[-1]
-        for candidate, before, after in zip(chosen, steps, steps[1:], strict=False):
-            share = (before - after) / steps[0]
-            late_s = candidate.setting.number("late", 0.0) if candidate.fault == "delay" else None
-            if share < 0.005 or steps[-1] > 0.75 * steps[0] or (late_s is not None and late_s < _LATE_S):
+        for c, before, after in zip(chosen, steps, steps[1:], strict=False):
+            share, late = (before - after) / steps[0], c.fault == "delay"
+            late_s = c.setting.get("late", 0.0) + c.setting.get("stale", 0) * float(np.median(np.diff(log.t)))
+            if share < 0.005 or steps[-1] > 0.75 * steps[0] or (late and late_s < _LATE_S):
                 continue
-            question, numbers = ("contract", {}) if late_s is None else ("timing", {"late_s": late_s})
-            findings.append(
-                Finding(candidate.fault, question, candidate.text(candidate.setting), share, numbers))  # fmt: skip
+            question, numbers = ("timing", {"late_s": late_s}) if late else ("contract", {})
+            findings.append(Finding(c.fault, question, c.text(c.setting), share, numbers))
         none = not any(f.question == "contract" for f in findings)
         if name in ("network", "normaliser") and steps[-1] > 0.3 and none:
             text = "the network does not give the logged actions, whatever order, sign, frame, scale or normaliser"
@@ -319,11 +336,14 @@ def solve_contract(
     return findings, errors
 
 
-def frozen_sensors(log: Log) -> list[Finding]:
-    """Return a finding if the IMU repeats itself while joints move."""
-    moving = np.abs(np.diff(log.q, axis=0)).max(1) > 1e-4
-    for name in ("gyro", "quat"):
-        values: np.ndarray | None = getattr(log, name)
+def frozen_sensors(log: Log, joints: Sequence[str]) -> list[Finding]:
+    """Return a finding if the IMU or a joint repeats its values while others move."""
+    change = np.abs(np.diff(log.q, axis=0)) > 1e-4
+    imu = [("frozen imu", f"the IMU's {n}", getattr(log, n), change.any(1)) for n in ("gyro", "quat")]
+    of_joints = [("frozen joint", f"the encoder of {joint}", log.q[:, [i]], np.delete(change, i, 1).all(1))
+                 for i, joint in enumerate(joints) if len(joints) > 1]  # fmt: skip
+    findings: dict[str, Finding] = {}
+    for fault, what, values, moving in [*imu, *of_joints]:
         if values is None:
             continue
         same = (np.diff(values, axis=0) == 0.0).all(1)
@@ -332,6 +352,6 @@ def frozen_sensors(log: Log) -> list[Finding]:
         begin, end = ends[longest] + 1, ends[longest + 1]
         from_s, for_s = float(log.state_t[begin]), float(log.state_t[end] - log.state_t[begin])
         if for_s > 0.5 and (same & moving)[begin:end].sum() > 20:
-            text = f"the IMU's {name} repeats one value for {for_s:.1f} s from {from_s:.2f} s on, while joints move"
-            return [Finding("frozen imu", "contract", text, 1.0, {"from_s": from_s, "for_s": for_s})]
-    return []
+            text = f"{what} repeats one value for {for_s:.1f} s from {from_s:.2f} s on, while joints move"
+            findings.setdefault(fault, Finding(fault, "contract", text, 1.0, {"from_s": from_s, "for_s": for_s}))
+    return list(findings.values())

@@ -67,16 +67,28 @@ def deployment(fault: str, folder: Path, logged: tuple[str, ...]) -> tuple[Polic
             ang = turned(quat[i], ang, True)
         if fault == "world frame":
             ang = turned(quat[i], ang, False)
+        if fault == "quaternion order":
+            down = turned(np.roll(quat[i], 1), np.array([0, 0, -1.0]), True)
+        if fault == "axes":
+            ang = ang[[1, 0, 2]] * [1, -1, 1]
         now, then = q[late][order] - DEFAULT, q[max(0, late - 1)][order] - DEFAULT
+        if fault == "frozen joint":
+            now, then = (np.where([0, 0, 1, 0], q[min(k, 100)] - DEFAULT, q[k] - DEFAULT) for k in (i, max(0, i - 1)))
         if fault == "sign":
             now, then = now * [1, -1, 1, 1], then * [1, -1, 1, 1]
         if fault == "default pose":
             now, then = now - [0, 0.2, 0, 0], then - [0, 0.2, 0, 0]
         velocity = dq[late][order] * (10.0 if fault == "scale" else 1.0) * ([1, -1, 1, 1] if fault == "sign" else 1)
-        pair = (now, then) if fault == "history reversed" else (then, now)
-        obs = np.concatenate([0.25 * ang, down, *pair, 0.1 * velocity, last, command[i]])
+        if fault == "frozen joint":
+            velocity = np.where([0, 0, 1, 0], dq[min(i, 100)], velocity)
+        pair = (now, then) if fault == "history reversed" else (now, now) if fault == "history order" else (then, now)
+        previous = {"missing term": 0.0 * last, "last action": DEFAULT + 0.5 * last}.get(fault, last)
+        terms = [0.25 * ang, down, *pair, 0.1 * velocity, previous, command[i]]
+        if fault == "term order":
+            terms[0], terms[1] = terms[1], terms[0]
+        obs = np.concatenate(terms)
         spoilt = obs * np.linspace(0.6, 1.6, len(obs)) + 0.1 if fault == "normaliser" else obs
-        last = other(spoilt[None])[0]
+        last = np.clip(other(spoilt[None])[0], *((-0.5, 0.5) if fault == "action clipped" else (-9, 9)))
         for name, value in (("observation", obs), ("action", last), ("target", DEFAULT + 0.5 * last)):
             rows[name].append(value)
     log = {"t": time, "q": q, "dq": dq, "gyro": gyro, "quat": quat, "command": command}
@@ -88,7 +100,8 @@ def deployment(fault: str, folder: Path, logged: tuple[str, ...]) -> tuple[Polic
 @pytest.mark.parametrize(
     "fault",
     ["joint order", "left and right", "sign", "gyro rotated twice", "world frame", "frozen imu", "default pose",
-     "scale", "history reversed", "normaliser", "delay", ""],
+     "scale", "history reversed", "normaliser", "delay", "quaternion order", "axes", "frozen joint", "history order",
+     "missing term", "last action", "term order", "action clipped", ""],
 )  # fmt: skip
 def test_the_fault_of_a_deployment_is_named(fault: str, logged: tuple[str, ...], tmp_path: Path) -> None:
     policy, path = deployment(fault, tmp_path, logged)

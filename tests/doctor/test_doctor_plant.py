@@ -34,10 +34,15 @@ def brief(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(before, "_SECONDS", 1.3)
 
 
-def recorded(folder: Path, kp: float = 1.0, limit: float = 1e6, delay_s: float = 0.01, rate: float = 50.0) -> Path:
+def recorded(
+    folder: Path, kp: float = 1.0, limit: float = 1e6, delay_s: float = 0.01, rate: float = 50.0, fade: float = 0.0,
+    zero: float = 0.0, friction: float = 0.0, sign: float = 1.0, payload: float = 0.0, kd: float = 1.0,
+) -> Path:  # fmt: skip
     """Write the log of a robot with its own loop of control; the targets are leaps and waves."""
     model = mujoco.MjModel.from_xml_string(XML.replace('0.4"', '0.41"').replace("0.0025", "0.001"))
     data, rng = mujoco.MjData(model), np.random.default_rng(1)
+    model.dof_frictionloss[1] = friction
+    model.body_mass[2] += payload
     rows: dict[str, list] = {"t": [], "q": [], "dq": [], "target": []}
     waiting, goal = [(0.0, np.zeros(2))], np.zeros(2)
     for tick in range(8000):
@@ -45,12 +50,13 @@ def recorded(folder: Path, kp: float = 1.0, limit: float = 1e6, delay_s: float =
         if tick % round(1000 / rate) == 0:
             target = 0.5 * np.sin(np.array([4.0, 6.0]) * now) + 0.3 * np.sign(np.sin(np.array([2.1, 2.9]) * now))
             waiting.append((now + delay_s, target))
-            for name, value in (("t", now), ("q", data.qpos + 5e-4 * rng.normal(size=2)),
-                                ("dq", data.qvel + 0.02 * rng.normal(size=2)), ("target", target)):  # fmt: skip
+            q, dq = data.qpos + 5e-4 * rng.normal(size=2), data.qvel + 0.02 * rng.normal(size=2)
+            for name, value in {"t": now, "q": q * [1, sign], "dq": dq * [1, sign], "target": target}.items():
                 rows[name].append(value)
         while waiting and waiting[0][0] <= now:
             goal = waiting.pop(0)[1]
-        torque = kp * np.array([8.0, 5.0]) * (goal - data.qpos) - np.array([0.3, 0.2]) * data.qvel
+        strength = kp * (1 - fade * now / 8.0) * np.array([8.0, 5.0])
+        torque = strength * (goal - data.qpos - [0, zero]) - kd * np.array([0.3, 0.2]) * data.qvel
         data.qfrc_applied[:] = np.clip(torque, -limit, limit)
         mujoco.mj_step(model, data)
     np.savez(folder / "log.npz", **{k: np.array(v) for k, v in rows.items()})
@@ -60,9 +66,11 @@ def recorded(folder: Path, kp: float = 1.0, limit: float = 1e6, delay_s: float =
 
 @pytest.mark.parametrize(
     ("setting", "fault"),
-    [({}, ""), ({"kp": 0.5}, "gain"), ({"limit": 1.0}, "torque limit"), ({"delay_s": 0.035}, "delay")],
-    ids=["sound", "gain", "limit", "delay"],
-)
+    [({}, ""), ({"kp": 0.5}, "gain"), ({"limit": 1.0}, "torque limit"), ({"delay_s": 0.035}, "delay"),
+     ({"fade": 0.6}, "battery"), ({"zero": 0.15}, "zero offset"), ({"friction": 0.4}, "friction"),
+     ({"sign": -1.0}, "sign"), ({"payload": 0.3}, "payload"), ({"kd": 0.2}, "damping")],
+    ids=["sound", "gain", "limit", "delay", "battery", "zero", "friction", "sign", "payload", "damping"],
+)  # fmt: skip
 def test_the_fault_of_a_plant_is_named(setting: dict[str, float], fault: str, tmp_path: Path) -> None:
     log = read_deployment(recorded(tmp_path, **setting), CONTRACT.joints)
     found, figures = solve_plant(Drives(tmp_path / "robot.xml", CONTRACT), log, CONTRACT)
