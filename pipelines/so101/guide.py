@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sim2real.hardware.bus.servos import ServoJoint
 from sim2real.hardware.calibration import Nudge
 
-from .robot import JOINTS, SERVOS, TRAVEL_RAD, SO101Robot, calibrations, find, read
+from .robot import SERVOS, TRAVEL_RAD, SO101Robot, calibrations, find, read
 
 MIDDLE = "upper arm upright, forearm and hand level and forward, jaw half open"
 """The pose in which every joint is in the middle of its travel."""
@@ -20,8 +19,7 @@ _MOTIONS = (
     ("shoulder_pan", "turn the arm to its right, clockwise as seen from above", 1),
 )
 NUDGES = tuple(Nudge(joint, words, direction, TRAVEL_RAD.get(joint)) for joint, words, direction in _MOTIONS)
-IDS = dict(zip(SERVOS.ids, JOINTS, strict=True))
-BAUD_RATE = SERVOS.baud_rate
+IDS, BAUD_RATE = SERVOS.ids, SERVOS.baud_rate
 
 
 def robot(calibration: Path) -> SO101Robot:
@@ -29,8 +27,8 @@ def robot(calibration: Path) -> SO101Robot:
     return SO101Robot(calibration=calibration)
 
 
-def calibration_of(joints: tuple[ServoJoint, ...]) -> Path:
-    """Return LeRobot's calibration of the arm with these servos: of several files, that with their homing offsets.
+def calibration_of(offsets: list[int]) -> Path:
+    """Return LeRobot's calibration of the arm: of several files, that with the homing offsets of its servos.
 
     Raises:
         UsageError: There is none, or it is refused; see `read`.
@@ -38,5 +36,4 @@ def calibration_of(joints: tuple[ServoJoint, ...]) -> Path:
     paths = calibrations()[1]
     if len(paths) < 2:
         return find()
-    offsets = [joint.homing_offset for joint in joints]
     return next((p for p in paths if [joint.homing_offset for joint in read(p)] == offsets), paths[0])

@@ -231,18 +231,19 @@ def calibrate(port: str, guide: Any, path: Path) -> None:
         HardwareLost: A servo or the motion contradicts the calibration. No motor has moved.
     """
     from sim2real.hardware.bus.port import BusConfig
-    from sim2real.hardware.calibration import HandMotion, find_servos, follow
-    from sim2real.hardware.feetech import StsServos
+    from sim2real.hardware.calibration import HandMotion, follow
+    from sim2real.hardware.feetech import HOMING_OFFSET, StsServos
     from sim2real.stages.terminal.console import note
 
     # Find the servos, and the file that belongs to them.
-    present = find_servos(port, guide.IDS, guide.BAUD_RATE)
-    note(f"{len(present)} servos answer on {port}", urgent=True)
-    source: Path = guide.calibration_of(present)
+    bus = BusConfig(port, guide.BAUD_RATE, max_silence_s=_SILENCE_S)
+    with StsServos(bus, guide.IDS) as servos:
+        note(f"{len(guide.IDS)} servos answer on {port}", urgent=True)
+        source: Path = guide.calibration_of([servos.link.read(i, HOMING_OFFSET) for i in guide.IDS])
     joints = guide.read(source)
     note(f"calibration: {source}", urgent=True)
     # Opening compares models, homing offsets and limits with the calibration, and takes the torque off.
-    with StsServos(BusConfig(port, guide.BAUD_RATE, max_silence_s=_SILENCE_S), joints) as servos:
+    with StsServos(bus, joints) as servos:
         motion = HandMotion(joints, guide.NUDGES)
         note(f"torque is off. Move the arm by hand. Its middle pose: {guide.MIDDLE}", urgent=True)
         follow(servos, motion, lambda words: note(f"- {words}", urgent=True))

@@ -47,8 +47,8 @@ def modes(arm):
 
 RANGE = GOOD["shoulder_pan"]["range_min"], GOOD["shoulder_pan"]["range_max"]
 FAULTS = {
-    "missing servo": ({"missing": 5}, {}, {}, r"no servo answers .* joint 'wrist_roll' \(id 5\)\. Ids that answer"),
-    "wrong baud rate": ({}, {}, {"baud_rate": 115_200}, "answer at 115200 baud, not at 1000000"),
+    "missing servo": ({"missing": 5}, {}, {}, r"servo 5 does not answer .* Available: \[1, 2, 3, 4, 6\]"),
+    "wrong baud rate": ({}, {}, {"baud_rate": 115_200}, "does not answer on .* at 1000000 baud"),
     "wrong model": ({}, {}, {"model_number": 1284}, "is model 1284"),
     "another arm's file": ({}, {}, {"homing_offset": -310}, "has homing offset -310, its calibration has 85"),
     "ids exchanged in the file": (
