@@ -92,7 +92,8 @@ class HingeDrive(RobotDrive):
 
     def device(self, port: str, silence_s: float, embedded: bool) -> DynamixelServos:
         from sim2real.hardware.bus.port import BusConfig
-        from sim2real.hardware.dynamixel import DynamixelServos, VoltageDrive
+        from sim2real.hardware.bus.servos import VoltageDrive
+        from sim2real.hardware.dynamixel import DynamixelServos
 
         from .plant import SUPPLY_V
 

@@ -26,8 +26,7 @@ from sim2real.robots.servo.task import Aim, AimTask, ServoAgent, ServoMoment, un
 from sim2real.types import Array, Key
 
 if TYPE_CHECKING:
-    from sim2real.hardware.bus.servos import ServoJoint
-    from sim2real.hardware.feetech import StsDrive
+    from sim2real.hardware.bus.servos import PositionDrive, ServoJoint
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 """LeRobot's names, in the order of the servos' ids."""
@@ -126,7 +125,7 @@ def embedded() -> Embedded:
     return Embedded(SO101Plant, emulator)
 
 
-def calibrated(embedded: bool, calibration: Path | None = None) -> StsDrive:
+def calibrated(embedded: bool, calibration: Path | None = None) -> PositionDrive:
     """Return the servos' settings with the calibration of the arm on a port, or of the embedded one."""
     joints = read(Path(__file__).with_name("calibration.json") if embedded else calibration or find())
     return replace(SHEET.drive, joints=joints)

@@ -9,18 +9,15 @@ packets with ROBOTIS' own SDK.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import IntEnum
-from typing import Final
+from typing import Any, Final
 
-import numpy as np
-
-from sim2real.errors import SafetyStop, Sim2RealError, UsageError
+from sim2real.errors import SafetyStop, Sim2RealError
 from sim2real.hardware.bus.packets import Answer, Instruction, Packet, PacketFormat
 from sim2real.hardware.bus.port import BusConfig
 from sim2real.hardware.bus.registers import TWOS_COMPLEMENT, Family, Register, ServoModel, eeprom, ram
-from sim2real.hardware.bus.servos import Drive, ServoJoint, Servos, within
-from sim2real.hardware.device import VOLTAGE, OperatingMode
+from sim2real.hardware.bus.servos import ServoJoint, Servos
+from sim2real.hardware.device import POSITION, VOLTAGE, OperatingMode
 
 HEADER: Final = b"\xff\xff\xfd\x00"
 MAX_PACKET_LENGTH: Final = 1024
@@ -184,7 +181,10 @@ FAMILY: Final = Family(
     PRESENT_TEMPERATURE.end,
     baud_rates=(9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000),
     torque=TORQUE_ENABLE,
-    goal=GOAL_POSITION,
+    modes={
+        VOLTAGE: (OperatingMode.PWM, GOAL_PWM),
+        POSITION: (OperatingMode.POSITION, GOAL_POSITION),
+    },
     goals=(GOAL_PWM, GOAL_VELOCITY, GOAL_POSITION),
     limits=(MIN_POSITION_LIMIT, MAX_POSITION_LIMIT),
     mode=OPERATING_MODE,
@@ -199,6 +199,7 @@ FAMILY: Final = Family(
     voltage=PRESENT_INPUT_VOLTAGE,
     temperature=PRESENT_TEMPERATURE,
     begin={STATUS_RETURN_LEVEL: 2, RETURN_DELAY_TIME: 0},
+    fixed={POSITION_I_GAIN: 0, PROFILE_ACCELERATION: 0},
     watched=(BUS_WATCHDOG,),
     full_rad=PWM_FULL_SCALE * P_GAIN_PER_PWM * RAD_PER_COUNT,
     models=MODELS,
@@ -209,93 +210,6 @@ FAMILY: Final = Family(
 def model(number: int) -> ServoModel:
     """Return the model of a number; an unknown one counts as a model that continues without its host."""
     return MODELS.get(number, ServoModel(f"model {number}", False, "unknown model: the worst is assumed"))
-
-
-@dataclass(frozen=True)
-class VoltageDrive(Drive):
-    """Servos in PWM mode, commanded in volts, at rest 0 V. Angles are measured from each encoder's zero [rad].
-
-    Args:
-        supply_v: Voltage of a motor at full PWM [V].
-    """
-
-    supply_v: float
-    kind = VOLTAGE
-    mode = int(OperatingMode.PWM)
-    goal = GOAL_PWM
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.supply_v < math.inf:
-            raise UsageError(f"supply_v = {self.supply_v} must be larger than 0")
-
-    @property
-    def count_unit(self) -> float:
-        """A count of PWM [V]."""
-        return self.supply_v * GOAL_PWM.unit
-
-    def registers(self) -> dict[Register, int]:
-        return {}
-
-    def joints_of(self, ids: Sequence[int]) -> tuple[ServoJoint, ...]:
-        """Return joints at the encoders' zeros."""
-        return tuple(ServoJoint(f"servo {i}", i, zero_count=0.0) for i in ids)
-
-
-@dataclass(frozen=True)
-class PositionDrive(Drive):
-    """Servos in position mode, commanded in joint angles [rad]; at rest they hold their position.
-
-    A joint's angle is 0 where its encoder reads `zero_count`. The servos accept goals within one revolution, counts 0
-    to 4095, so a joint with its zero at the centre moves between -pi and pi.
-
-    Args:
-        p_gain: Position P Gain of every servo [counts].
-        profile_velocity_rad_s: Speed at which a servo's setpoint moves to its goal [rad/s], rounded to a multiple of
-            0.024 rad/s of at least one; inf: the setpoint is the goal.
-        d_gain: Position D Gain of every servo [counts].
-        zero_count: Encoder count at the joint's zero: one for all servos, or one per servo.
-    """
-
-    p_gain: int
-    profile_velocity_rad_s: float
-    d_gain: int = 0
-    zero_count: int | tuple[int, ...] = 2048
-    mode = int(OperatingMode.POSITION)
-    goal = GOAL_POSITION
-
-    def __post_init__(self) -> None:
-        within(self.registers())
-        counts = np.asarray(self.zero_count)
-        if np.any(counts < 0) or np.any(counts >= COUNTS_PER_REVOLUTION):
-            raise UsageError(f"position drive: zero_count = {self.zero_count} is outside the encoder's revolution")
-
-    @property
-    def speed_rad_s(self) -> float:
-        """Speed of the setpoint [rad/s]."""
-        return self.profile_velocity_rad_s
-
-    def registers(self) -> dict[Register, int]:
-        if not self.profile_velocity_rad_s > 0.0:
-            raise UsageError(
-                f"position drive: profile_velocity_rad_s = {self.profile_velocity_rad_s} must be larger than 0",
-                hint="inf switches the profile off",
-            )
-        unlimited = math.isinf(self.profile_velocity_rad_s)  # the register's 0 means unlimited: never round to it
-        velocity = 0 if unlimited else max(1, PROFILE_VELOCITY.count(self.profile_velocity_rad_s))
-        return {
-            POSITION_P_GAIN: self.p_gain,
-            POSITION_I_GAIN: 0,
-            POSITION_D_GAIN: self.d_gain,
-            PROFILE_ACCELERATION: 0,
-            PROFILE_VELOCITY: velocity,
-        }
-
-    def joints_of(self, ids: Sequence[int]) -> tuple[ServoJoint, ...]:
-        """Return joints with the zeros of these settings; refuse a wrong number of them."""
-        zeros = self.zero_count if isinstance(self.zero_count, tuple) else (self.zero_count,) * len(ids)
-        if len(zeros) != len(ids):
-            raise UsageError(f"position drive: {len(zeros)} zero counts for {len(ids)} servos")
-        return tuple(ServoJoint(f"servo {i}", i, zero_count=zero) for i, zero in zip(ids, zeros, strict=True))
 
 
 class DynamixelServos(Servos):
@@ -330,6 +244,6 @@ class DynamixelServos(Servos):
         return Sim2RealError(f"servo {servo_id} refused {what}: {_REASONS.get(error, f'error {error}')}")
 
 
-def servos(port: str, ids: Sequence[int], drive: Drive, *, baud_rate: int, silence_s: float) -> DynamixelServos:
+def servos(port: str, ids: Sequence[int], drive: Any, *, baud_rate: int, silence_s: float) -> DynamixelServos:
     """Return servos on a port, not opened yet: the device of the name ``dynamixel``; see ``DeviceFactory``."""
     return DynamixelServos(BusConfig.patient(port, baud_rate, silence_s), ids, drive)

@@ -14,15 +14,15 @@ assumptions.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import combinations
 from typing import Final
 
-from sim2real.errors import HardwareLost, SafetyStop, UsageError
+from sim2real.errors import HardwareLost, SafetyStop
 from sim2real.hardware.bus.packets import BROADCAST_ID, Answer, Packet, PacketFormat
 from sim2real.hardware.bus.port import BusConfig
 from sim2real.hardware.bus.registers import Family, Register, ServoModel, eeprom, ram
-from sim2real.hardware.bus.servos import Drive, ServoJoint, Servos, within
+from sim2real.hardware.bus.servos import PositionDrive, ServoJoint, Servos
+from sim2real.hardware.device import POSITION
 
 HEADER: Final = b"\xff\xff"
 
@@ -132,7 +132,7 @@ FAMILY: Final = Family(
     87,
     BAUD_RATES,
     torque=TORQUE_ENABLE,
-    goal=GOAL_POSITION,
+    modes={POSITION: (0, GOAL_POSITION)},
     goals=(GOAL_POSITION, GOAL_TIME, GOAL_SPEED),
     limits=(MIN_POSITION, MAX_POSITION),
     mode=OPERATING_MODE,
@@ -147,6 +147,7 @@ FAMILY: Final = Family(
     voltage=PRESENT_VOLTAGE,
     temperature=PRESENT_TEMPERATURE,
     begin={RESPONSE_LEVEL: 1, LOCK: 1, RETURN_DELAY_TIME: 0},
+    fixed={I_GAIN: 0, ACCELERATION: 0, TORQUE_LIMIT: LOAD_FULL_SCALE},
     watched=(TORQUE_ENABLE, ACCELERATION, GOAL_SPEED, TORQUE_LIMIT),
     full_rad=1.0 / DUTY_PER_RAD_AND_GAIN,
     models=MODELS,
@@ -158,53 +159,8 @@ def speed_unit_rad_s(phase: int) -> float:
     return RAD_PER_COUNT * (1 if phase & PHASE_COUNTS_PER_S else 50)
 
 
-@dataclass(frozen=True)
-class StsDrive(Drive):
-    """Gains and limits with which the servos follow a position.
-
-    Settings are written while the servos' lock is on: they last until the power goes.
-
-    Args:
-        p_gain: P gain; LeRobot uses 16.
-        speed_rad_s: Speed at which a servo's setpoint moves to its goal; inf: the setpoint is the goal.
-        torque: Largest fraction of a servo's torque, in (0, 1].
-        joints: The joints, e.g. from `read_calibration`; a servo without one gets a joint with its zero at 2048 counts.
-    """
-
-    p_gain: int = 16
-    d_gain: int = 32
-    i_gain: int = 0
-    speed_rad_s: float = math.inf
-    torque: float = 1.0
-    joints: tuple[ServoJoint, ...] = ()
-    mode = 0  # follow a position
-    goal = GOAL_POSITION
-
-    def __post_init__(self) -> None:
-        if not self.speed_rad_s > 0.0:
-            raise UsageError(f"speed_rad_s = {self.speed_rad_s} must be larger than 0", hint="inf: no limit")
-        if not 0.0 < self.torque <= 1.0:
-            raise UsageError(f"torque = {self.torque} is not a fraction in (0, 1]")
-        within(self.registers())
-
-    def registers(self, phase: int = PHASE.default) -> dict[Register, int]:
-        """Return the registers' values [counts] for a servo whose register Phase holds `phase`."""
-        # Goal Speed 0 means "stop" for some servos: the smallest value is 1, and the largest their top speed.
-        fastest = 0 if phase & PHASE_ZERO_IS_FASTEST else FASTEST_COUNTS_PER_S
-        speed = self.speed_rad_s / speed_unit_rad_s(phase)
-        return {
-            P_GAIN: self.p_gain,
-            D_GAIN: self.d_gain,
-            I_GAIN: self.i_gain,
-            ACCELERATION: 0,  # no limit
-            GOAL_SPEED: fastest if speed > GOAL_SPEED.maximum else max(1, round(speed)),
-            TORQUE_LIMIT: TORQUE_LIMIT.count(self.torque),
-        }
-
-    def joints_of(self, ids: Sequence[int]) -> tuple[ServoJoint, ...]:
-        """Return the joints of a calibration, and for other servos those around the middle of their encoder."""
-        known = {joint.servo_id: joint for joint in self.joints}
-        return tuple(known.get(i) or ServoJoint(f"servo {i}", i) for i in ids)
+LEROBOT: Final = PositionDrive(p_gain=16, d_gain=32)
+"""LeRobot's gains."""
 
 
 class StsServos(Servos):
@@ -215,10 +171,9 @@ class StsServos(Servos):
 
     family = FAMILY
 
-    def __init__(self, config: BusConfig, joints: Sequence[ServoJoint | int], drive: StsDrive | None = None) -> None:
-        self._sts = drive or StsDrive()
-        super().__init__(config, joints, self._sts)
-        self._phases = dict.fromkeys(self.ids, PHASE.default)
+    def __init__(self, config: BusConfig, joints: Sequence[ServoJoint | int], drive: PositionDrive = LEROBOT) -> None:
+        self._phases: dict[int, int] = {}
+        super().__init__(config, joints, drive)
 
     def failure(self, answer: Answer, what: str) -> Exception:
         """Return SafetyStop, as the error byte holds alarms."""
@@ -240,13 +195,16 @@ class StsServos(Servos):
             )
         self._phases[servo_id] = link.read(servo_id, PHASE)
 
-    def settings(self, servo_id: int) -> dict[Register, int]:
-        return self._sts.registers(self._phases[servo_id])
-
     def speed_unit(self, servo_id: int) -> float:
-        return speed_unit_rad_s(self._phases[servo_id])
+        return speed_unit_rad_s(self._phases.get(servo_id, PHASE.default))
+
+    def speed_count(self, servo_id: int, speed_rad_s: float) -> int:
+        """Return the count for the speed of a servo's setpoint: 0 means "stop" for some, and top speed for others."""
+        fastest = 0 if self._phases.get(servo_id, PHASE.default) & PHASE_ZERO_IS_FASTEST else FASTEST_COUNTS_PER_S
+        count = speed_rad_s / self.speed_unit(servo_id)
+        return fastest if count > GOAL_SPEED.maximum else max(1, round(count))
 
 
-def servos(port: str, ids: Sequence[int], drive: StsDrive, *, baud_rate: int, silence_s: float) -> StsServos:
+def servos(port: str, ids: Sequence[int], drive: PositionDrive, *, baud_rate: int, silence_s: float) -> StsServos:
     """Return servos on a port, not opened yet: the device of the name ``feetech``; see ``DeviceFactory``."""
     return StsServos(BusConfig.patient(port, baud_rate, silence_s), ids, drive)

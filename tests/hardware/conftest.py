@@ -5,7 +5,8 @@ from virtual_bus import VirtualBus
 from sim2real.emulation.bus import VirtualRobot
 from sim2real.emulation.dynamixel import EmulatorConfig
 from sim2real.hardware.bus.port import BusConfig
-from sim2real.hardware.dynamixel import DynamixelServos, VoltageDrive
+from sim2real.hardware.bus.servos import VoltageDrive
+from sim2real.hardware.dynamixel import DynamixelServos
 
 
 @pytest.fixture

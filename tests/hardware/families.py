@@ -18,9 +18,9 @@ from sim2real.emulation.feetech import StsEmulation
 from sim2real.hardware import dynamixel as dynamixel
 from sim2real.hardware import feetech as feetech
 from sim2real.hardware.bus.port import BusConfig
-from sim2real.hardware.bus.servos import ServoJoint
+from sim2real.hardware.bus.servos import PositionDrive, ServoJoint, VoltageDrive
 from sim2real.hardware.device import Device, OperatingMode
-from sim2real.hardware.dynamixel import DynamixelServos, PositionDrive, VoltageDrive
+from sim2real.hardware.dynamixel import DynamixelServos
 from sim2real.hardware.feetech import StsServos
 from sim2real.hardware.safety.gate import GateConfig
 from sim2real.hardware.safety.rig import Rig
@@ -100,7 +100,7 @@ def _volts(port, **limits):
 
 
 def _angles(port, **limits):
-    return DynamixelServos(BusConfig(port, **limits), IDS, PositionDrive(p_gain=800, profile_velocity_rad_s=20.0))
+    return DynamixelServos(BusConfig(port, **limits), IDS, PositionDrive(800, 20.0))
 
 
 def _sts(port, **limits):

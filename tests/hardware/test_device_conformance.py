@@ -11,8 +11,8 @@ from sim2real.emulation.conformance import DeviceConformance
 from sim2real.emulation.dynamixel import EmulatorConfig
 from sim2real.emulation.feetech import StsEmulation
 from sim2real.hardware.bus.port import BusConfig
-from sim2real.hardware.bus.servos import ServoJoint
-from sim2real.hardware.dynamixel import DynamixelServos, PositionDrive, VoltageDrive
+from sim2real.hardware.bus.servos import PositionDrive, ServoJoint, VoltageDrive
+from sim2real.hardware.dynamixel import DynamixelServos
 from sim2real.hardware.feetech import StsServos
 
 
@@ -31,7 +31,7 @@ class TestThreeServosByAngle(DeviceConformance):
 
     def make_device(self, port):
         bus = BusConfig(port, max_silence_s=0.5, silence_s=0.6)
-        return DynamixelServos(bus, (1, 2, 3), PositionDrive(p_gain=800, profile_velocity_rad_s=20.0))
+        return DynamixelServos(bus, (1, 2, 3), PositionDrive(800, 20.0))
 
 
 class TestFeetech(DeviceConformance):

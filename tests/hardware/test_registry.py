@@ -3,7 +3,8 @@
 import pytest
 
 from sim2real.errors import UsageError
-from sim2real.hardware.dynamixel import DynamixelServos, VoltageDrive
+from sim2real.hardware.bus.servos import VoltageDrive
+from sim2real.hardware.dynamixel import DynamixelServos
 from sim2real.hardware.registry import available, load_device
 
 PACKAGE = """

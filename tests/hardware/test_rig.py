@@ -7,8 +7,9 @@ from sim2real.emulation.truth import Kind
 from sim2real.errors import HardwareLost
 from sim2real.hardware import dynamixel as reg
 from sim2real.hardware.bus.port import BusConfig
+from sim2real.hardware.bus.servos import VoltageDrive
 from sim2real.hardware.device import OperatingMode
-from sim2real.hardware.dynamixel import DynamixelServos, VoltageDrive
+from sim2real.hardware.dynamixel import DynamixelServos
 from sim2real.hardware.safety.gate import GateConfig
 from sim2real.hardware.safety.rig import Rig
 

@@ -13,17 +13,18 @@ from sim2real.hardware import dynamixel as reg
 from sim2real.hardware import feetech as sts
 from sim2real.hardware.bus.packets import Instruction
 from sim2real.hardware.bus.port import BusConfig
+from sim2real.hardware.bus.servos import PositionDrive, VoltageDrive
 from sim2real.hardware.bus.servos import ServoJoint as Joint
 from sim2real.hardware.device import OperatingMode
-from sim2real.hardware.dynamixel import PROTOCOL, DynamixelServos, PositionDrive, VoltageDrive
-from sim2real.hardware.feetech import StsDrive, StsServos
+from sim2real.hardware.dynamixel import PROTOCOL, DynamixelServos
+from sim2real.hardware.feetech import LEROBOT, StsServos
 from sim2real.hardware.registry import load_device
 from sim2real.hardware.safety.gate import GateConfig
 from sim2real.hardware.safety.rig import Rig
 
 START_RAD = np.array([0.5, -0.8, 0.3])
 COUNT_RAD = reg.RAD_PER_COUNT
-DRIVE = PositionDrive(p_gain=800, profile_velocity_rad_s=20.0)
+DRIVE = PositionDrive(800, 20.0)
 GATE = {"limit": 1.5, "first_step_rad": np.inf, "slew_per_s": None, "stale": "hold"}
 BOTH = pytest.mark.parametrize("family", [ANGLES, STS], ids=lambda family: family.name)
 
@@ -32,7 +33,7 @@ def angles(robot, drive=DRIVE, **limits):
     return DynamixelServos(BusConfig(robot.port, **{"silence_s": 1.0, **limits}), IDS, drive)
 
 
-def feetech(robot, joints=IDS, drive=None, **limits):
+def feetech(robot, joints=IDS, drive=LEROBOT, **limits):
     return StsServos(BusConfig(robot.port, **{"silence_s": 1.0, **limits}), joints, drive)
 
 
@@ -62,7 +63,7 @@ def run(rig, goal, duration_s, period_s=0.02):
 
 
 def test_angles_count_from_the_joints_zero(rig_of):
-    drive = PositionDrive(800, 20.0, zero_count=(2048, 1000, 3000))
+    drive = PositionDrive(800, 20.0, joints=(Joint("b", 2, 1000), Joint("c", 3, 3000)))
     zeros = (np.array([2048, 1000, 3000]) - 2048) * COUNT_RAD
     rig, _ = rig_of(drive=drive, limit=(-1.5, 1.0))
     assert rig.measure().position_rad == pytest.approx(START_RAD - zeros, abs=COUNT_RAD)
@@ -74,7 +75,7 @@ def test_angles_count_from_the_joints_zero(rig_of):
 def test_a_direction_and_a_zero():
     joints = [Joint("a", 1, direction=-1), Joint("b", 2), Joint("c", 3, zero_count=2148)]
     expected = np.array([-0.5, -0.8, 0.3 - 100 * COUNT_RAD])
-    with feetech(STS.robot(), joints, StsDrive(p_gain=254)) as device:
+    with feetech(STS.robot(), joints, PositionDrive(254)) as device:
         assert device.measure().position_rad == pytest.approx(expected, abs=COUNT_RAD)
         assert device.enable() == pytest.approx(expected, abs=COUNT_RAD)
         goal = expected + np.array([0.2, 0.1, -0.1])
@@ -93,9 +94,9 @@ def test_a_direction_and_a_zero():
         (ANGLES, lambda robot: angles(robot, PositionDrive(800, 0.001)), {reg.PROFILE_VELOCITY: 1}),
         (VOLTS, lambda robot: angles(robot, VoltageDrive(5.0), silence_s=0.1),
          {reg.OPERATING_MODE: 16, reg.RETURN_DELAY_TIME: 0, reg.TORQUE_ENABLE: 1, reg.BUS_WATCHDOG: 5}),
-        (STS, lambda robot: feetech(robot, drive=StsDrive(20, 5, 1, speed_rad_s=2.0, torque=0.5)),
-         {sts.P_GAIN: 20, sts.D_GAIN: 5, sts.I_GAIN: 1, sts.GOAL_SPEED: 1304, sts.ACCELERATION: 0,
-          sts.TORQUE_LIMIT: 500, sts.RETURN_DELAY_TIME: 0, sts.LOCK: 1, sts.OPERATING_MODE: 0}),
+        (STS, lambda robot: feetech(robot, drive=PositionDrive(20, 2.0, d_gain=5)),
+         {sts.P_GAIN: 20, sts.D_GAIN: 5, sts.I_GAIN: 0, sts.GOAL_SPEED: 1304, sts.ACCELERATION: 0,
+          sts.TORQUE_LIMIT: 1000, sts.RETURN_DELAY_TIME: 0, sts.LOCK: 1, sts.OPERATING_MODE: 0}),
     ],
 )  # fmt: skip
 def test_settings_reach_the_servos_and_those_that_were_lost_are_noticed(family, device, expected):
@@ -147,7 +148,7 @@ def test_profiles_are_by_speed_and_goals_switch_no_torque_on(monkeypatch, found,
 def test_speeds_of_servos_with_the_other_unit():
     robot = STS.robot("Ramp", speed_rad_s=1.0)
     robot.bus.servos[1].put(sts.PHASE, 0)
-    with feetech(robot, (1,), StsDrive(speed_rad_s=3.0)) as device:
+    with feetech(robot, (1,), PositionDrive(16, speed_rad_s=3.0)) as device:
         assert device.measure().velocity_rad_s == pytest.approx([1.0], abs=0.04)
         assert robot.bus.servos[1].get(sts.GOAL_SPEED) == 39  # of 0.732 rpm
 
@@ -311,29 +312,26 @@ def test_servos_that_do_not_fit_their_joints(change, joint, said):
 )
 def test_configurations_that_make_no_sense(kind, config, joints, message):
     with pytest.raises(UsageError, match=message):
-        kind(BusConfig("/dev/null", **config), joints, StsDrive() if kind is StsServos else VoltageDrive(5.0))
+        kind(BusConfig("/dev/null", **config), joints, LEROBOT if kind is StsServos else VoltageDrive(5.0))
 
 
 @pytest.mark.parametrize(
-    ("drive", "settings", "message"),
+    ("kind", "drive", "message"),
     [
-        (PositionDrive, {"p_gain": 20_000}, "position_p_gain = 20000 is outside"),
-        (PositionDrive, {"d_gain": -1}, "position_d_gain = -1 is outside"),
-        (PositionDrive, {"profile_velocity_rad_s": 0.0}, "profile_velocity_rad_s = 0.0 must be larger"),
-        (PositionDrive, {"profile_velocity_rad_s": math.nan}, "profile_velocity_rad_s = nan must be larger"),
-        (PositionDrive, {"profile_velocity_rad_s": 1000.0}, "profile_velocity = .* is outside"),
-        (PositionDrive, {"zero_count": (2048, 4096)}, "zero_count"),
-        (VoltageDrive, {"supply_v": 0.0}, "supply_v"),
-        (VoltageDrive, {"supply_v": math.nan}, "supply_v"),
-        (StsDrive, {"p_gain": 255}, "p_gain"),
-        (StsDrive, {"speed_rad_s": 0.0}, "speed_rad_s"),
-        (StsDrive, {"torque": 1.5}, "torque"),
+        (DynamixelServos, lambda: PositionDrive(20_000), "position_p_gain = 20000 is outside"),
+        (DynamixelServos, lambda: PositionDrive(800, d_gain=-1), "position_d_gain = -1 is outside"),
+        (DynamixelServos, lambda: PositionDrive(800, 0.0), "speed_rad_s = 0.0 must be larger"),
+        (DynamixelServos, lambda: PositionDrive(800, math.nan), "speed_rad_s = nan must be larger"),
+        (DynamixelServos, lambda: PositionDrive(800, 1000.0), "profile_velocity = .* is outside"),
+        (DynamixelServos, lambda: VoltageDrive(0.0), "supply_v"),
+        (DynamixelServos, lambda: VoltageDrive(math.nan), "supply_v"),
+        (StsServos, lambda: PositionDrive(255), "p_gain = 255 is outside"),
+        (StsServos, lambda: VoltageDrive(5.0), "Feetech servos take no volts"),
     ],
 )
-def test_drives_that_registers_cannot_hold(drive, settings, message):
-    sound = {"p_gain": 800, "profile_velocity_rad_s": 1.0} if drive is PositionDrive else {}
+def test_drives_that_registers_cannot_hold(kind, drive, message):
     with pytest.raises(UsageError, match=message):
-        drive(**{**sound, **settings})
+        kind(BusConfig("/dev/ttyNONE"), IDS, drive())
 
 
 @pytest.mark.parametrize(
@@ -341,7 +339,6 @@ def test_drives_that_registers_cannot_hold(drive, settings, message):
     [
         (DRIVE, {"stale": "zero"}, "stale = 'zero' is not safe with positions"),
         (VoltageDrive(5.0), {}, "stale = 'hold' is not safe with volts"),
-        (PositionDrive(800, 1.0, zero_count=(1, 2)), {}, "2 zero counts for 3 servos"),
     ],
 )
 def test_gates_that_do_not_fit_are_refused_before_the_port_is_opened(drive, gate, message):
@@ -393,7 +390,7 @@ def test_what_they_do_without_a_host_is_said():
 
 
 def test_servos_by_the_devices_name():
-    drive = StsDrive(joints=(Joint("lift", 2, direction=-1), Joint("elbow", 3)))
+    drive = PositionDrive(16, joints=(Joint("lift", 2, direction=-1), Joint("elbow", 3)))
     with load_device("feetech")(STS.robot().port, (1, 2), drive, baud_rate=1_000_000, silence_s=0.2) as device:
         assert device.silence_s == 0.2
         assert [joint.name for joint in device.joints] == ["servo 1", "lift"]

@@ -1,7 +1,5 @@
 """A family of servos is a table: one that nobody has, with its driver, its emulator and all tests of a device."""
 
-from dataclasses import dataclass
-
 from plants import Joints
 
 from sim2real.emulation.bus import BusEmulation
@@ -10,7 +8,8 @@ from sim2real.emulation.servos import ServoBus, ServoFirmware
 from sim2real.hardware import feetech
 from sim2real.hardware.bus.port import BusConfig
 from sim2real.hardware.bus.registers import Family, Register, ServoModel, eeprom, ram
-from sim2real.hardware.bus.servos import Drive, Servos
+from sim2real.hardware.bus.servos import PositionDrive, Servos
+from sim2real.hardware.device import POSITION as POSITION_KIND
 
 RAD = 6.283185307179586 / 4096
 ID, MODE, DELAY = eeprom("id", 5, 1, 0, 253, 1), eeprom("mode", 6, 1, 0, 1), eeprom("return_delay", 7, 1, 0, 254)
@@ -23,20 +22,12 @@ MODEL, FIRMWARE = Register("model", 0, 2, default=7), Register("firmware", 2, 1,
 VOLTS, WARMTH = Register("voltage", 46, 1, default=74), Register("temperature", 47, 1, default=25)
 FAMILY = Family(
     "Acme", feetech.PROTOCOL, list(globals().values()), 96, (1_000_000,),
-    torque=TORQUE, goal=GOAL, goals=(GOAL,), limits=(LOW, HIGH), mode=MODE, model_number=MODEL, servo_id=ID,
+    torque=TORQUE, modes={POSITION_KIND: (0, GOAL)}, goals=(GOAL,), limits=(LOW, HIGH), mode=MODE,
+    model_number=MODEL, servo_id=ID,
     return_delay=DELAY, position=POSITION, velocity=VELOCITY, load=LOAD, controller=(P, D, SPEED), firmware=(FIRMWARE,),
-    voltage=VOLTS, temperature=WARMTH, begin={DELAY: 0}, watched=(TORQUE,), full_rad=500.0,
+    voltage=VOLTS, temperature=WARMTH, begin={DELAY: 0}, fixed={}, watched=(TORQUE,), full_rad=500.0,
     models={7: ServoModel("Acme 7", None, "this file")},
 )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class AcmeDrive(Drive):
-    p_gain: int = 800
-    mode, goal = 0, GOAL
-
-    def registers(self):
-        return {P: self.p_gain}
 
 
 class AcmeServos(Servos):
@@ -62,4 +53,4 @@ class TestAcme(DeviceConformance):
     emulation, plant = AcmeEmulation, Joints
 
     def make_device(self, port):
-        return AcmeServos(BusConfig(port, max_silence_s=0.5, silence_s=0.6), (1, 2, 3), AcmeDrive())
+        return AcmeServos(BusConfig(port, max_silence_s=0.5, silence_s=0.6), (1, 2, 3), PositionDrive(800))

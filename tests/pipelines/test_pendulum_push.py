@@ -8,7 +8,8 @@ from sim2real.emulation.dynamixel import EmulatorConfig
 from sim2real.errors import SafetyStop
 from sim2real.hardware import dynamixel as reg
 from sim2real.hardware.bus.port import BusConfig
-from sim2real.hardware.dynamixel import DynamixelServos, VoltageDrive
+from sim2real.hardware.bus.servos import VoltageDrive
+from sim2real.hardware.dynamixel import DynamixelServos
 from sim2real.hardware.safety.gate import GateConfig
 from sim2real.hardware.safety.rig import Rig
 from sim2real.stages.load import load_robot

@@ -30,7 +30,8 @@ import os, signal, sys, time
 import numpy as np
 from sim2real.errors import Sim2RealError
 from sim2real.hardware.bus.port import BusConfig
-from sim2real.hardware.dynamixel import DynamixelServos, VoltageDrive
+from sim2real.hardware.bus.servos import VoltageDrive
+from sim2real.hardware.dynamixel import DynamixelServos
 
 bus = DynamixelServos(BusConfig({port!r}, silence_s={silence_s}, max_silence_s=1.0), (1, 2, 3), VoltageDrive(1.0))
 bus.open()

@@ -7,6 +7,7 @@ from functools import partial
 from typing import Final
 
 from sim2real.hardware.bus.packets import PacketFormat
+from sim2real.hardware.device import POSITION, CommandKind
 
 TWOS_COMPLEMENT: Final = -1
 RETURN_DELAY_UNIT_S: Final = 2e-6
@@ -98,7 +99,7 @@ class Family:
         size: Number of bytes of the memory.
         baud_rates: Bits per second that they support.
         torque: Holds 0 while torque is off.
-        goal: The goal of the position controller.
+        modes: Kind of command -> the value of `mode` with it, and the register of the command.
         goals: All registers that can move the motor while torque is on.
         limits: The lowest and the highest position that they follow; both 0: no limit.
         mode: The operating mode.
@@ -108,6 +109,7 @@ class Family:
         voltage: The supply voltage, in units of 0.1 V.
         temperature: The motor's temperature [deg C].
         begin: Values that are written at `open`, such as "answer every instruction".
+        fixed: Values that are written before torque goes on, beside those of the controller.
         watched: Neighbouring registers that `check` compares with the values that were written.
         full_rad: Position error times P gain at which the controller gives full torque [rad].
         models: Model number -> model.
@@ -121,7 +123,7 @@ class Family:
     size: int
     baud_rates: tuple[int, ...]
     torque: Register
-    goal: Register
+    modes: Mapping[CommandKind, tuple[int, Register]]
     goals: tuple[Register, ...]
     limits: tuple[Register, Register]
     mode: Register
@@ -136,6 +138,7 @@ class Family:
     voltage: Register
     temperature: Register
     begin: Mapping[Register, int]
+    fixed: Mapping[Register, int]
     watched: tuple[Register, ...]
     full_rad: float
     models: Mapping[int, ServoModel]
@@ -146,6 +149,11 @@ class Family:
     def __post_init__(self) -> None:
         registers = sorted((r for r in self.named if isinstance(r, Register)), key=lambda r: r.address)
         object.__setattr__(self, "registers", {r.address: r for r in registers})
+
+    @property
+    def goal(self) -> Register:
+        """The goal of the position controller."""
+        return self.modes[POSITION][1]
 
     @property
     def longest_silence_s(self) -> float:

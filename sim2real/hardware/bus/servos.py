@@ -3,7 +3,6 @@
 import atexit
 import logging
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from sim2real.hardware.bus.packets import BROADCAST_ID, Answer, Instruction
 from sim2real.hardware.bus.port import BusConfig
 from sim2real.hardware.bus.registers import Family, Register, ServoModel
 from sim2real.hardware.clock import SYSTEM_CLOCK, Clock
-from sim2real.hardware.device import POSITION, CommandKind, Counters, Device, Reading, Transaction
+from sim2real.hardware.device import POSITION, VOLTAGE, CommandKind, Counters, Device, Reading, Transaction
 from sim2real.hardware.safety.following import MOST_SHARE, RESPONSE_S, SLOW_RAD_S, Following
 
 _LOGGER = logging.getLogger(__name__)
@@ -78,37 +77,43 @@ class ServoJoint:
         return round(self.zero_count + angle_rad / self.rad_per_count)
 
 
-class Drive(ABC):
-    """The settings with which servos follow one kind of command.
+@dataclass(frozen=True)
+class PositionDrive:
+    """Servos that follow goals of their joints [rad]; at rest they hold their positions.
 
-    Attributes:
-        mode: Value of the family's register `mode`.
-        goal: The register of the command.
-        count_unit: A count of it, in the unit of the command; for positions, the joints say it.
-        speed_rad_s: Speed at which a setpoint moves to its goal.
+    Args:
+        p_gain: P gain of every servo's position controller [counts].
+        speed_rad_s: Speed at which a servo's setpoint moves to its goal, at least a count; inf: the setpoint is the
+            goal.
+        d_gain: D gain [counts]. I gains are 0.
+        joints: The joints, e.g. from `read_calibration`; a servo without one gets a joint around the middle of a turn.
     """
 
-    kind: ClassVar[CommandKind] = POSITION
-    mode: ClassVar[int]
-    goal: ClassVar[Register]
-    count_unit: float = 1.0
+    p_gain: int
     speed_rad_s: float = math.inf
+    d_gain: int = 0
+    joints: tuple[ServoJoint, ...] = ()
+    kind: ClassVar[CommandKind] = POSITION
 
-    @abstractmethod
-    def registers(self) -> dict[Register, int]:
-        """Return the registers that the settings are in, and their values [counts]."""
-
-    def joints_of(self, ids: Sequence[int]) -> tuple[ServoJoint, ...]:
-        """Return the joints of servos without a calibration."""
-        return tuple(ServoJoint(f"servo {i}", i) for i in ids)
+    def __post_init__(self) -> None:
+        if not self.speed_rad_s > 0.0:
+            raise UsageError(f"speed_rad_s = {self.speed_rad_s} must be larger than 0", hint="inf: no limit")
 
 
-def within(values: dict[Register, int]) -> dict[Register, int]:
-    """Return values of registers; raise UsageError for one that its register cannot hold."""
-    for register, value in values.items():
-        if not register.minimum <= value <= register.maximum:
-            raise UsageError(f"{register.name} = {value} is outside [{register.minimum}, {register.maximum}]")
-    return values
+@dataclass(frozen=True)
+class VoltageDrive:
+    """Servos that are commanded in volts, at rest 0 V. Angles are measured from each encoder's zero [rad].
+
+    Args:
+        supply_v: Voltage of a motor at full PWM [V].
+    """
+
+    supply_v: float
+    kind: ClassVar[CommandKind] = VOLTAGE
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.supply_v < math.inf:
+            raise UsageError(f"supply_v = {self.supply_v} must be larger than 0")
 
 
 class Servos(Device):
@@ -118,8 +123,8 @@ class Servos(Device):
     its handler calls `make_safe`. If this process is killed or hangs, the guardian takes the torque off: a separate
     process that is started before torque goes on.
 
-    A subclass is a family: its table, and where it differs, `failure`, `model`, `settings`, `prepare` and
-    `speed_unit`. Servos may not report that they refuse a value, so every setting is read back; EEPROM registers are
+    A subclass is a family: its table, and where it differs, `failure`, `model`, `prepare`, `speed_unit` and
+    `speed_count`. Servos may not report that they refuse a value, so every setting is read back; EEPROM registers are
     written only if their value differs, as writing wears them out.
 
     Args:
@@ -136,7 +141,9 @@ class Servos(Device):
 
     family: ClassVar[Family]
 
-    def __init__(self, config: BusConfig, joints: Sequence[ServoJoint | int], drive: Drive) -> None:
+    def __init__(
+        self, config: BusConfig, joints: Sequence[ServoJoint | int], drive: PositionDrive | VoltageDrive
+    ) -> None:
         family, rates = self.family, self.family.baud_rates
         if config.baud_rate not in rates:
             raise UsageError(
@@ -144,35 +151,45 @@ class Servos(Device):
             )
         if config.silence_s > family.longest_silence_s:
             raise UsageError(f"silence_s = {config.silence_s} is outside [0, {family.longest_silence_s}]")
-        plain = {j.servo_id: j for j in drive.joints_of([j for j in joints if isinstance(j, int)])}
+        if drive.kind not in family.modes:
+            raise UsageError(f"{family.name} servos take no {drive.kind.name}")
         self.config, self.drive = config, drive
-        self.joints = tuple(plain[j] if isinstance(j, int) else j for j in joints)
+        self._mode, self.goal = family.modes[drive.kind]
+        follows = isinstance(drive, PositionDrive)
+        plain = {joint.servo_id: joint for joint in (drive.joints if follows else ())}
+        middle = ServoJoint.zero_count if follows else 0.0
+        self.joints = tuple(
+            plain.get(j) or ServoJoint(f"servo {j}", j, middle) if isinstance(j, int) else j for j in joints
+        )
         self.ids = tuple(joint.servo_id for joint in self.joints)
         if not self.ids or len(set(self.ids)) < len(self.ids) or not all(0 <= i < BROADCAST_ID for i in self.ids):
             raise UsageError(
                 f"servos {list(self.ids)}: there must be at least one, each with an id of its own, from 0 to "
                 f"{BROADCAST_ID - 1}"
             )
+        for register, value in self.settings(self.ids[0]).items():
+            if not register.minimum <= value <= register.maximum:
+                raise UsageError(f"{register.name} = {value} is outside [{register.minimum}, {register.maximum}]")
         # Built here, as make_safe must not need any time.
         self._off_packet = family.form.write_each(family.torque, dict.fromkeys(self.ids, 0))
         self.models: dict[int, ServoModel] = {}
         self.armed = self.halted = False
         self._link: ServoLink | None = None
         # Counts of goals: zero, unit of the command, and range; `open` narrows it to the servos' own.
-        joints_, n, positions = self.joints, len(self.ids), drive.kind is POSITION
-        self._at_zero = np.array([joint.zero_count for joint in joints_])
-        self._rad = np.array([joint.rad_per_count for joint in joints_])
-        self._zero = self._at_zero if positions else np.zeros(n)
-        self._unit = self._rad if positions else np.full(n, drive.count_unit)
-        self._low = np.array([j.low_count if positions else drive.goal.minimum for j in joints_])
-        self._high = np.array([j.high_count if positions else drive.goal.maximum for j in joints_])
+        self._at_zero = np.array([joint.zero_count for joint in self.joints])
+        self._rad = np.array([joint.rad_per_count for joint in self.joints])
+        self._zero, self._unit = self._at_zero, self._rad
+        self._low, self._high = np.array([(joint.low_count, joint.high_count) for joint in self.joints]).T
+        if isinstance(drive, VoltageDrive):
+            self._zero = np.zeros(len(self.ids))
+            self._unit = np.full(len(self.ids), drive.supply_v * self.goal.unit)
+            self._low, self._high = self._zero + self.goal.minimum, self._zero + self.goal.maximum
         # The registers of the state, in one block, and units of speed and load; `open` reads the servos' own of speed.
         state = (family.position, family.velocity, family.load)
         self._state = sorted(state, key=lambda register: register.address)
         self._of_state = [self._state.index(register) for register in state]
-        sign = np.array([joint.direction for joint in joints_])
-        self._sign, self._load = sign, sign * family.load.unit
-        self._speed = sign * family.velocity.unit
+        self._sign = np.array([joint.direction for joint in self.joints])
+        self._load, self._speed = self._sign * family.load.unit, self._sign * family.velocity.unit
 
     # -- what differs between families
 
@@ -187,11 +204,6 @@ class Servos(Device):
             raise HardwareLost(f"servo {servo_id} is model {number}, which is not supported. Available: {names}")
         return self.family.models[number]
 
-    def settings(self, servo_id: int) -> dict[Register, int]:
-        """Return the registers of a servo's drive, and their values [counts]."""
-        del servo_id
-        return self.drive.registers()
-
     def prepare(self, joint: ServoJoint) -> None:
         """Read or write what the settings depend on, with torque off."""
         del joint
@@ -200,6 +212,11 @@ class Servos(Device):
         """Return a count of a servo's measured speed [rad/s]."""
         del servo_id
         return self.family.velocity.unit
+
+    def speed_count(self, servo_id: int, speed_rad_s: float) -> int:
+        """Return the count for the speed of a servo's setpoint [rad/s]: 0 is unlimited, so none is rounded to it."""
+        del servo_id
+        return 0 if math.isinf(speed_rad_s) else max(1, self.family.controller[2].count(speed_rad_s))
 
     # -- properties
 
@@ -236,6 +253,14 @@ class Servos(Device):
         watchdog = self.family.watchdog
         return max(1, watchdog.count(self.silence_s)) if watchdog is not None and self.silence_s > 0.0 else 0
 
+    def settings(self, servo_id: int) -> dict[Register, int]:
+        """Return the registers of a servo's drive, and their values [counts]."""
+        if isinstance(self.drive, VoltageDrive):
+            return {}
+        p_gain, d_gain, speed = self.family.controller
+        speed_count = self.speed_count(servo_id, self.drive.speed_rad_s)
+        return {**self.family.fixed, p_gain: self.drive.p_gain, d_gain: self.drive.d_gain, speed: speed_count}
+
     # -- from open to close
 
     def open(self) -> None:
@@ -252,7 +277,7 @@ class Servos(Device):
                 self._find(joint)
                 if not self.release(joint.servo_id):
                     raise HardwareLost(f"servo {joint.servo_id} does not confirm that its torque is off")
-                for register, value in {**self.family.begin, self.family.mode: self.drive.mode}.items():
+                for register, value in {**self.family.begin, self.family.mode: self._mode}.items():
                     self._link.set(joint.servo_id, register, value)
                 self.prepare(joint)
                 self._write(joint.servo_id, self.settings(joint.servo_id))
@@ -286,11 +311,10 @@ class Servos(Device):
 
     def following(self) -> Following | None:
         """Return how joints follow their goals: near the limit, a servo pushes with nearly all of its torque."""
-        p_gain = self.settings(self.ids[0]).get(self.family.controller[0]) if self.models else None
-        if self.drive.kind is not POSITION or not p_gain:
+        if isinstance(self.drive, VoltageDrive) or not self.drive.p_gain:
             return None
         speed_rad_s = min(SLOW_RAD_S, 0.5 * self.drive.speed_rad_s)
-        return Following(MOST_SHARE * self.family.full_rad / p_gain, RESPONSE_S, speed_rad_s)
+        return Following(MOST_SHARE * self.family.full_rad / self.drive.p_gain, RESPONSE_S, speed_rad_s)
 
     def enable(self) -> np.ndarray:
         """Write settings, which a servo may have lost, and goals at rest, and switch the torque on."""
@@ -305,7 +329,7 @@ class Servos(Device):
                 link.write(servo_id, family.watchdog, 0)
             self._write(servo_id, self.settings(servo_id))
             goals[i] = self._goal_at_rest(i)
-            link.set(servo_id, self.drive.goal, int(goals[i]))
+            link.set(servo_id, self.goal, int(goals[i]))
             link.write(servo_id, family.torque, 1)
             if family.watchdog is not None:
                 # Torque may set the goals to rest by itself.
@@ -342,8 +366,8 @@ class Servos(Device):
             )
         goals = np.clip(np.rint(counts), self._low, self._high).astype(int).tolist()
         if len(goals) == 1:
-            return self.link.write(self.ids[0], self.drive.goal, goals[0])
-        return self.link.write_each(self.drive.goal, dict(zip(self.ids, goals, strict=True)))
+            return self.link.write(self.ids[0], self.goal, goals[0])
+        return self.link.write_each(self.goal, dict(zip(self.ids, goals, strict=True)))
 
     def check(self) -> None:
         """Raise SafetyStop if a servo's watchdog has tripped, or it has lost its settings, as by a restart.
@@ -500,7 +524,7 @@ class Servos(Device):
     def _narrow(self, joint: ServoJoint) -> None:
         """Keep goals within the servo's own limits, which must hold a calibrated joint's whole range."""
         low, high = (self.link.read(joint.servo_id, register) for register in self.family.limits)
-        if self.drive.kind is not POSITION or (low, high) == (0, 0):
+        if isinstance(self.drive, VoltageDrive) or (low, high) == (0, 0):
             return
         if joint.homing_offset is not None and not low <= joint.low_count < joint.high_count <= high:
             raise HardwareLost(
@@ -517,7 +541,7 @@ class Servos(Device):
 
     def _goal_at_rest(self, i: int) -> int:
         """Return the goal that keeps a joint at rest; raise SafetyStop if it is far outside its range."""
-        if self.drive.kind is not POSITION:
+        if isinstance(self.drive, VoltageDrive):
             return 0
         joint, low, high = self.joints[i], int(self._low[i]), int(self._high[i])
         count = self.link.read(joint.servo_id, self.family.position)

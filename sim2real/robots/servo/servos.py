@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -20,9 +20,9 @@ from sim2real.robots.probe import Probe
 from sim2real.robots.robot import Embedded, RobotDrive, RobotSensor
 
 if TYPE_CHECKING:
+    from sim2real.hardware.bus.registers import Family
+    from sim2real.hardware.bus.servos import PositionDrive
     from sim2real.hardware.device import Device, Reading
-    from sim2real.hardware.dynamixel import PositionDrive
-    from sim2real.hardware.feetech import StsDrive
     from sim2real.hardware.joint import Joint
     from sim2real.hardware.safety.gate import GateConfig, GateLimits
     from sim2real.hardware.safety.rig import Rig
@@ -38,6 +38,7 @@ class DataSheet:
         armature: Inertia of the rotor, as seen at the gear's output [kg m^2].
         friction: Dry friction [N m], at standstill if it decreases with speed.
         p_gain: Position P Gain [counts].
+        d_gain: Position D Gain [counts].
         profile_rad_s: Profile Velocity [rad/s].
         model_number: Model number of the servos; a twin of the robot emulates that model's firmware.
         stribeck_rad_s: Speed at which 1/e of the dry friction is left [rad/s]; None: it is the same at every speed.
@@ -48,14 +49,16 @@ class DataSheet:
     armature: float
     friction: float
     p_gain: int = 800
+    d_gain: int = 0
     profile_rad_s: float = 5.0
     model_number: int = 1060
     stribeck_rad_s: float | None = None
+    family: ClassVar[Family] = dynamixel.FAMILY
 
     @property
     def full_rad(self) -> float:
         """Position error at which the duty is full [rad]."""
-        return dynamixel.FAMILY.full_rad / self.p_gain
+        return self.family.full_rad / self.p_gain
 
     @property
     def gain(self) -> float:
@@ -63,11 +66,11 @@ class DataSheet:
         return self.stall / self.full_rad
 
     @property
-    def drive(self) -> PositionDrive | StsDrive:
+    def drive(self) -> PositionDrive:
         """The drive with these settings, for the robot's device."""
-        from sim2real.hardware.dynamixel import PositionDrive
+        from sim2real.hardware.bus.servos import PositionDrive
 
-        return PositionDrive(self.p_gain, self.profile_rad_s)
+        return PositionDrive(self.p_gain, self.profile_rad_s, self.d_gain)
 
 
 @dataclass(frozen=True)
@@ -75,18 +78,10 @@ class StsSheet(DataSheet):
     """Data of a Feetech STS servo; its device is ``feetech``. Default settings are LeRobot's."""
 
     p_gain: int = 16
+    d_gain: int = 32
     profile_rad_s: float = math.inf
     model_number: int = 777
-
-    @property
-    def full_rad(self) -> float:
-        return feetech.FAMILY.full_rad / self.p_gain
-
-    @property
-    def drive(self) -> StsDrive:
-        from sim2real.hardware.feetech import StsDrive
-
-        return StsDrive(self.p_gain, speed_rad_s=self.profile_rad_s)
+    family = feetech.FAMILY
 
 
 def name_of(joint: Joint | str) -> str:

@@ -4,7 +4,7 @@ from families import IDS
 from sim2real.emulation.feetech import StsEmulation
 from sim2real.hardware.bus.port import BusConfig
 from sim2real.hardware.bus.servos import ServoJoint as Joint
-from sim2real.hardware.feetech import StsServos
+from sim2real.hardware.feetech import LEROBOT, StsServos
 
 STS = StsEmulation(return_delay_us=0)
 
@@ -20,7 +20,7 @@ def connect():
     """Open a device to emulated servos."""
     devices = []
 
-    def open_(robot, ids=IDS, joints=None, drive=None, **config):
+    def open_(robot, ids=IDS, joints=None, drive=LEROBOT, **config):
         joints = joints or [Joint(f"joint{i}", i) for i in ids]
         device = StsServos(BusConfig(robot.port, **{"silence_s": 1.0, **config}), joints, drive)
         devices.append(device)
