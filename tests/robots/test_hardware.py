@@ -9,6 +9,7 @@ import pytest
 from sim2real.artifacts.timing import Timing
 from sim2real.emulation.truth import Kind, read_truth
 from sim2real.errors import SafetyStop, UsageError
+from sim2real.hardware.bus.servos import ServoJoint
 from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.safety.gate import GateLimits
 from sim2real.log.reader import read_log
@@ -176,7 +177,7 @@ def test_a_joint_without_weight_is_brought_back_to_where_episodes_start(episodes
 def test_an_arm_that_rests_somewhere_else_is_refused(arm, tmp_path, why):
     """Brought to where it should rest, the shoulder falls."""
     if why.startswith("zero"):
-        robot = with_drive(arm, zero_count=(2048, 2048 - 600, 2048))
+        robot = with_drive(arm, joints=(ServoJoint("shoulder", 2, 2048 - 600),))
     else:
         robot = changed(arm, rest=(0.0, 0.9, 0.0))
     with (

@@ -30,7 +30,7 @@ def test_a_data_sheets_gain_is_the_torque_of_a_step_of_error():
     counts = 885 / (800 / 256)
     assert sheet.full_rad == pytest.approx(counts * 2 * np.pi / 4096, rel=1e-6)
     assert sheet.gain == pytest.approx(1.4 / sheet.full_rad)
-    assert (sheet.drive.p_gain, sheet.drive.profile_velocity_rad_s, sheet.drive.d_gain) == (800, 5.0, 0)
+    assert (sheet.drive.p_gain, sheet.drive.speed_rad_s, sheet.drive.d_gain) == (800, 5.0, 0)
 
 
 def test_nominal_values_are_the_data_sheets_without_delays(pair):
