@@ -101,18 +101,6 @@ class Firmware(Protocol):
     def trip_watchdog(self) -> None: ...
 
 
-class PacketParser(Protocol):
-    """Finds packets in a byte stream that arrives in chunks."""
-
-    def clear(self) -> None:
-        """Forget the beginning of an incomplete packet."""
-        ...
-
-    def feed(self, chunk: bytes) -> list[tuple[Any, int]]:
-        """Return the packets that a chunk completes, each with the number of bytes of it up to the packet's end."""
-        ...
-
-
 B = TypeVar("B", bound=BusEmulation)
 
 
@@ -123,6 +111,7 @@ class PlannedBus(PlannedRobot[B]):
 
     Args:
         send: Delivers the bytes of an answer to the host; returns False if the host cannot take them.
+        parser: Finds packets in chunks of bytes, as `Parser` does.
         servos: Id -> firmware, ordered by id.
     """
 
@@ -132,7 +121,7 @@ class PlannedBus(PlannedRobot[B]):
         config: B,
         truth: TruthLog,
         send: Callable[[bytes], bool],
-        parser: PacketParser,
+        parser: Any,
         servos: Mapping[int, Firmware],
     ) -> None:
         super().__init__(config, truth)
@@ -293,6 +282,8 @@ class VirtualRobot(VirtualTime):
         port: The address, which `open_port` knows.
         bus: The emulated bus.
     """
+
+    advice = ""
 
     def __init__(self, plant: Plant, config: BusEmulation, truth_path: Path | None = None) -> None:
         self.plant: Any = plant

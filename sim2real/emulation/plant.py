@@ -3,7 +3,7 @@
 import heapq
 import math
 from collections.abc import Sequence
-from typing import Any, Final, Protocol, runtime_checkable
+from typing import Any, Final, Protocol
 
 import numpy as np
 
@@ -19,7 +19,9 @@ class Plant(Protocol):
     """A mechanism driven by servos; used by the emulator alone, in one thread.
 
     A plant need not inherit from this class. Times count from the emulator's start [s]; angles are those of the servos'
-    output shafts [rad].
+    output shafts [rad]. A plant that emulates the servos' position controllers also has ``configure(servo_id, p_gain,
+    d_gain, speed_rad_s)``: gains [counts], and the speed at which the setpoint moves to the goal. It is called at
+    time 0 for every servo with the power-up values, and whenever a write or a restart changes them.
     """
 
     servo_ids: tuple[int, ...]
@@ -51,24 +53,6 @@ class Plant(Protocol):
 
     def truth(self) -> dict[str, Any]:
         """Return the true parameters, which an identification should find, for the truth log's header."""
-        ...
-
-
-@runtime_checkable
-class ConfigurablePlant(Plant, Protocol):
-    """A plant that takes the settings of its servos' position controllers."""
-
-    def configure(self, servo_id: int, p_gain: int, d_gain: int, profile_velocity_rad_s: float) -> None:
-        """Set a servo's position controller from the plant's present time on.
-
-        Called for every servo at time 0 with the power-up values, and later whenever a write or a reboot changes them.
-
-        Args:
-            p_gain: Position P Gain [counts].
-            d_gain: Position D Gain [counts].
-            profile_velocity_rad_s: Speed at which the setpoint moves to the goal [rad/s]; inf: the setpoint is the
-                goal.
-        """
         ...
 
 
@@ -129,6 +113,7 @@ class PlantClock:
 
     def __init__(self, plant: Plant, step_ns: int, history_ns: int, truth: TruthLog) -> None:
         self._plant = plant
+        self._configure = getattr(plant, "configure", None)
         self._step_ns = step_ns
         self._truth = truth
         self._index = 0
@@ -149,10 +134,10 @@ class PlantClock:
             self._plant.advance(self._index * self._step_ns * 1e-9)
             self._remember()
 
-    def configure(self, servo_id: int, p_gain: int, d_gain: int, profile_velocity_rad_s: float) -> None:
-        """Pass the settings of a servo's controller to a `ConfigurablePlant`; arguments as there."""
-        if isinstance(self._plant, ConfigurablePlant):
-            self._plant.configure(servo_id, p_gain, d_gain, profile_velocity_rad_s)
+    def configure(self, servo_id: int, p_gain: int, d_gain: int, speed_rad_s: float) -> None:
+        """Pass the settings of a servo's controller to a plant that emulates it; see `Plant`."""
+        if self._configure is not None:
+            self._configure(servo_id, p_gain, d_gain, speed_rad_s)
 
     def schedule(self, t_ns: int, t_host_ns: int, servo_id: int, mode: int, goal: float) -> None:
         """Schedule a command at the grid point nearest to a time; commands at one point apply in their order here.
@@ -225,6 +210,7 @@ class MountedPlant:
             raise UsageError(f"{len(joints)} joints are mounted on {len(self.servo_ids)} servos")
         self._joints = dict(zip(self.servo_ids, joints, strict=True))
         self.advance, self.state, self.truth = inside.advance, inside.state, inside.truth
+        self._configure = getattr(inside, "configure", None)
 
     def command(self, servo_id: int, mode: int, goal: float) -> None:
         joint = self._joints[servo_id]
@@ -236,10 +222,9 @@ class MountedPlant:
             goal = joint.direction * goal
         self._plant.command(servo_id, mode, goal)
 
-    def configure(self, servo_id: int, p_gain: int, d_gain: int, profile_velocity_rad_s: float) -> None:
-        if isinstance(self._plant, ConfigurablePlant):
-            speed = profile_velocity_rad_s / self._joints[servo_id].gear
-            self._plant.configure(servo_id, p_gain, d_gain, speed)
+    def configure(self, servo_id: int, p_gain: int, d_gain: int, speed_rad_s: float) -> None:
+        if self._configure is not None:
+            self._configure(servo_id, p_gain, d_gain, speed_rad_s / self._joints[servo_id].gear)
 
     def measure(self, servo_id: int) -> tuple[float, float, float]:
         joint = self._joints[servo_id]

@@ -52,7 +52,7 @@ def held_up(rig, robot, point):
         "before its bus transaction": (rig.device, "command"),
         "before it has the bus": (rig.device.link, "_exchange"),
         "before its bytes are written": (robot, "write"),
-        "after its bytes are written": (rig.device.link, "_count_answer"),
+        "after its bytes are written": (rig.device.link, "_wire_ns"),
     }[point]
     inner = getattr(owner, name)
 

@@ -77,7 +77,7 @@ def test_the_data_sheets_torque_is_reached_at_an_error_of_a_third_of_a_radian():
     assert sheet.full_rad == pytest.approx(0.3765, abs=1e-4)
     assert sheet.gain == pytest.approx(7.81, abs=0.01)
     assert sheet.drive.p_gain == 16
-    assert sheet.drive.registers(0x0C)[registers.ACCELERATION] == 0, "as fast as it can"
+    assert registers.FAMILY.fixed[registers.ACCELERATION] == 0, "as fast as it can"
 
 
 @pytest.fixture

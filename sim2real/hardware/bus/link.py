@@ -8,12 +8,13 @@ import threading
 from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from sim2real.errors import HardwareLost, SafetyStop
-from sim2real.hardware.bus.packets import Answer, Instruction, Packet, Parser, of_servos
+from sim2real.hardware.bus.packets import Answer, Instruction, Packet, Parser
 from sim2real.hardware.bus.port import BusConfig, open_port
 from sim2real.hardware.bus.registers import Family, Register
 from sim2real.hardware.device import Counters, Transaction
@@ -28,6 +29,16 @@ _BUSY_SHARE: Final = 0.3  # of a silence: if this thread was held up for longer,
 _SCANNED: Final = 20
 _CONFIRMING_BYTES: Final = 17  # no other read is as long, so a late answer to another read cannot confirm
 _BARRIER_BYTES: Final = 18  # and more: the shortest read that only `_drain` makes
+
+
+@dataclass
+class _Silence:
+    """A time without answers: its begin and end, its missing answers, and for how long this thread did not run."""
+
+    begin_ns: int
+    end_ns: int
+    missed: int = 0
+    held_up_ns: int = 0
 
 
 class ServoLink:
@@ -63,9 +74,8 @@ class ServoLink:
         self._waiting: list[Packet] = []
         self._unsettled = False  # whether an answer to a read is missing and may still come
         self._drains = 0
-        # Begin and end of the present silence, None after an answer; and its missing answers.
-        self._silent_ns: tuple[int, int] | None = None
-        self._missed = self._held_up_ns = 0
+        self._silence = _Silence(0, 0)
+        self._is_silent = False
         self._sent_ns = 0
         self.port = open_port(config.port, config.baud_rate)
         self.clock = self.port.clock
@@ -82,29 +92,22 @@ class ServoLink:
         Args:
             despite_error: Whether an error in the answer is ignored.
         """
-        what = f"read of {register.name}"
-        data = self.read_each((servo_id,), register.address, register.size, what, despite_error)[0][0]
-        return register.decode(data)
-
-    def read_each(
-        self, servo_ids: Sequence[int], address: int, length: int, what: str, despite_error: bool = False
-    ) -> tuple[list[bytes], Transaction]:
-        """Read the same bytes of several servos' memory with one instruction; return those of each servo.
-
-        Args:
-            despite_error: Whether errors in the answers are ignored.
-        """
-        packet = self.form.read(servo_ids, address, length)
-        answers, transaction = self._exchange(packet, length, servo_ids, what, despite_error)
-        return [answer.data for answer in answers], transaction
+        counts, _ = self.read_counts((servo_id,), (register,), f"read of {register.name}", despite_error)
+        return int(counts[0, 0])
 
     def read_counts(
-        self, servo_ids: Sequence[int], registers: Sequence[Register], what: str
+        self, servo_ids: Sequence[int], registers: Sequence[Register], what: str, despite_error: bool = False
     ) -> tuple[np.ndarray, Transaction]:
-        """Read neighbouring registers, sorted by address, of several servos: ``(servos, registers)`` [counts]."""
+        """Read neighbouring registers, sorted by address, of several servos with one instruction.
+
+        Returns:
+            Their values ``(servos, registers)`` [counts].
+        """
         begin = registers[0].address
-        blocks, transaction = self.read_each(servo_ids, begin, registers[-1].end - begin, what)
-        counts = [[r.decode(block[r.address - begin : r.end - begin]) for r in registers] for block in blocks]
+        length = registers[-1].end - begin
+        packet = self.form.read(servo_ids, begin, length)
+        answers, transaction = self._exchange(packet, length, servo_ids, what, despite_error)
+        counts = [[r.decode(a.data[r.address - begin : r.end - begin]) for r in registers] for a in answers]
         return np.array(counts), transaction
 
     def write(self, servo_id: int, register: Register, value: int) -> Transaction:
@@ -118,12 +121,7 @@ class ServoLink:
         if self.read(servo_id, register) == value:
             return
         self.write(servo_id, register, value)
-        self.require(servo_id, register, value)
-
-    def require(self, servo_id: int, register: Register, value: int) -> None:
-        """Raise HardwareLost if a register does not hold the value that was written."""
-        current = self.read(servo_id, register)
-        if current != value:
+        if (current := self.read(servo_id, register)) != value:
             raise HardwareLost(
                 f"servo {servo_id} does not keep its settings: {register.name} is {current} after {value} was written",
                 hint="is its supply stable, its firmware another one?",
@@ -137,31 +135,14 @@ class ServoLink:
 
     def ping(self, servo_id: int) -> None:
         """Raise HardwareLost if a servo does not answer a ping; an error in its answer is ignored."""
-        self._exchange(self._ping(servo_id), self.form.ping_bytes, (servo_id,), "ping", despite_error=True)
+        packet = self.form.build(servo_id, Instruction.PING)
+        self._exchange(packet, self.form.ping_bytes, (servo_id,), "ping", despite_error=True)
 
     def scan(self) -> list[int]:
         """Return the ids below 20 that answer a ping of their own; a scan of all ids would take 2 s."""
+        ping, length = Instruction.PING, self.form.ping_bytes
         with self.hold():
-            length = self.form.ping_bytes
-            return [i for i in range(_SCANNED) if self._attempt(self._ping(i), (i,), length) is not None]
-
-    def force(self, servo_id: int, register: Register, value: int) -> bool:
-        """Write a register despite lock, missing answers and errors; return whether it reads back. Never raises."""
-        write = self.form.write(servo_id, register, value)
-        query = self.form.read((servo_id,), register.address, _CONFIRMING_BYTES)
-        # Go on without the lock after the timeout: taking the torque off matters more than an intact packet.
-        held = self._lock.acquire(timeout=_LOCK_TIMEOUT_S)
-        try:
-            for _ in range(_FORCED_ATTEMPTS):
-                with suppress(Exception):
-                    self._attempt(write, (servo_id,), 0)
-                    answers = self._attempt(query, (servo_id,), _CONFIRMING_BYTES)
-                    if answers and answers[0].data and register.decode(answers[0].data[: register.size]) == value:
-                        return True
-        finally:
-            if held:
-                self._lock.release()
-        return False
+            return [i for i in range(_SCANNED) if self._attempt(self.form.build(i, ping), (i,), length) is not None]
 
     def answering(self, packet: bytes, wait_s: float) -> list[int]:
         """Send an instruction once; return the ids of the answers that come within ``wait_s``, in their order."""
@@ -172,15 +153,23 @@ class ServoLink:
                 ids.append(answer.servo_id)
         return ids
 
+    def force(self, servo_id: int, register: Register, value: int) -> bool:
+        """Write a register despite lock, missing answers and errors; return whether it reads back. Never raises."""
+        write = self.form.write(servo_id, register, value)
+        query = self.form.read((servo_id,), register.address, _CONFIRMING_BYTES)
+        with self._grabbed():
+            for _ in range(_FORCED_ATTEMPTS):
+                with suppress(Exception):
+                    self._attempt(write, (servo_id,), 0)
+                    answers = self._attempt(query, (servo_id,), _CONFIRMING_BYTES)
+                    if answers and answers[0].data and register.decode(answers[0].data[: register.size]) == value:
+                        return True
+        return False
+
     def send_off(self) -> None:
         """Take the torque of all servos off with one instruction, after the one that is on the wire. Never raises."""
-        held = self._lock.acquire(timeout=_LOCK_TIMEOUT_S)
-        try:
-            with suppress(Exception):
-                self._send(self.off_packet)
-        finally:
-            if held:
-                self._lock.release()
+        with self._grabbed(), suppress(Exception):
+            self._send(self.off_packet)
 
     def make_safe(self) -> None:
         """Take the torque of all servos off, without the lock and without waiting for answers. Never raises.
@@ -204,6 +193,16 @@ class ServoLink:
                 raise HardwareLost(f"the bus on {self.config.port} is closed")
             yield
 
+    @contextmanager
+    def _grabbed(self) -> Iterator[None]:
+        """Have the bus in the block, after a while also without the lock: "off" matters more than a whole packet."""
+        held = self._lock.acquire(timeout=_LOCK_TIMEOUT_S)
+        try:
+            yield
+        finally:
+            if held:
+                self._lock.release()
+
     def _exchange(
         self,
         packet: bytes,
@@ -226,54 +225,61 @@ class ServoLink:
             SafetyStop: A servo has stopped itself; the guardian has taken over, or has died; or the instruction moves,
                 and the torque was taken off.
         """
-        requested_ns = self.clock.now_ns()
-        losses = 0
-        request = f"{what}{of_servos(servo_ids)}"
+        requested_ns, losses = self.clock.now_ns(), 0
+        request = what
+        if servo_ids:
+            request += f" of servo {servo_ids[0]}" if len(servo_ids) == 1 else f" of servos {tuple(servo_ids)}"
         with self.hold():
             began_ns = self.clock.now_ns()
             # A bus that was lost just now is lost for the next instruction, too, after a single missing answer.
-            silent_ns = self._silent_ns
-            if silent_ns is None or began_ns - silent_ns[1] > 1e9 * self.config.max_silence_s:
-                silent_ns, self._missed, self._held_up_ns = (began_ns, began_ns), 0, 0
-            while True:
-                # Show the guardian that this process lives, as often as the bus is used.
-                if self.guardian is not None:
-                    self.guardian.beat()
-                # Checked with the lock: whoever takes the torque off gets it afterwards.
-                if moves and self.at_rest:
-                    raise SafetyStop(f"no {what} is sent: the torque was taken off", hint="enable the device again")
-                try:
-                    answers = None
-                    # A write never waits for an empty line: it may take the torque off.
-                    if not length or not self._unsettled or self._drain(servo_ids[-1]):
-                        answers = self._attempt(packet, servo_ids, length)
-                        self._unsettled |= length > 0 and answers is None
-                except OSError as failure:
-                    self._require_watching()
-                    raise HardwareLost(f"{self.config.port} failed during {request}: {failure}") from failure
-                finally:
-                    # `make_safe` takes no lock: this instruction may have followed it, and some servos wake up at it.
-                    if moves and self.at_rest:
-                        self._repeat_off(0.0)  # the line is quiet, and others wait for it
-                now_ns = self.clock.now_ns()
-                if answers is not None:
-                    if servo_ids:
-                        self._silent_ns = None
-                    late_ns = self._count_answer(now_ns, self._wire_ns(packet, servo_ids, length))
-                    break
-                # An answer is missing: ask again, and give up after the longest silence.
+            if not self._is_silent or began_ns - self._silence.end_ns > 1e9 * self.config.max_silence_s:
+                self._silence = _Silence(began_ns, began_ns)
+            while (answers := self._try(packet, length, servo_ids, request, moves)) is None:
                 losses += 1
                 self._lost += 1
-                self._missed += 1
-                self._silent_ns = silent_ns = (silent_ns[0], now_ns)
-                self._require_heard(request, 1e-9 * (silent_ns[1] - silent_ns[0]))
+                self._is_silent = True
+                self._silence.missed += 1
+                self._silence.end_ns = self.clock.now_ns()
+                self._require_heard(request)
                 self._retries += 1
+            now_ns = self.clock.now_ns()
+            self._is_silent &= not servo_ids
+            # Count it, and by how much it was later than its bytes on the wire.
+            self._transactions += 1
+            late_ns = max(0, now_ns - self._sent_ns - self._wire_ns(packet, servo_ids, length))
+            self._late_us.append(min(late_ns // 1000, 1 << 30))
+            self._late += late_ns > 1e9 * self.config.late_after_s
             transaction = Transaction(self._sent_ns, began_ns - requested_ns, now_ns - began_ns, losses, late_ns)
         # Outside of the lock, as the error's cause is read from the servo.
         for answer in answers:
             if answer.error and not despite_error:
                 raise self._failure(answer, what)
         return answers, transaction
+
+    def _try(
+        self, packet: bytes, length: int, servo_ids: Sequence[int], request: str, moves: bool
+    ) -> list[Answer] | None:
+        """Send an instruction once; return its answers, or None if one is missing."""
+        # Show the guardian that this process lives, as often as the bus is used.
+        if self.guardian is not None:
+            self.guardian.beat()
+        # Checked with the lock: whoever takes the torque off gets it afterwards.
+        if moves and self.at_rest:
+            raise SafetyStop(f"no {request} is sent: the torque was taken off", hint="enable the device again")
+        try:
+            # A write never waits for an empty line: it may take the torque off.
+            if length and self._unsettled and not self._drain(servo_ids[-1]):
+                return None
+            answers = self._attempt(packet, servo_ids, length)
+            self._unsettled |= length > 0 and answers is None
+            return answers
+        except OSError as failure:
+            self._require_watching()
+            raise HardwareLost(f"{self.config.port} failed during {request}: {failure}") from failure
+        finally:
+            # `make_safe` takes no lock: this instruction may have followed it, and some servos wake up at it.
+            if moves and self.at_rest:
+                self._repeat_off(0.0)  # the line is quiet, and others wait for it
 
     def _repeat_off(self, pause_s: float) -> None:
         if not self.off_packet or self.closed:
@@ -287,7 +293,8 @@ class ServoLink:
     def _drain(self, servo_id: int) -> bool:
         """Let answers that are late pass: read as many bytes as no other read; the line keeps the order.
 
-        Taken for the answer to a repeated read, a late one would give its sample a time stamp that is 8 ms too late.
+        Taken for the answer to a repeated read, a late one would give its sample a time stamp that is 8 ms too late. To
+        wait until the line is quiet is not enough: an answer may be later than any such wait.
         """
         # Ask the last servo that is read: those before it have answered by then. Each of these reads has another
         # length: with two lengths in turn, answers that were 50 ms late ended later ones.
@@ -296,9 +303,6 @@ class ServoLink:
         length = _BARRIER_BYTES + self._drains % (self.family.size - begin - _BARRIER_BYTES + 1)
         self._unsettled = self._attempt(self.form.read((servo_id,), begin, length), (servo_id,), length) is None
         return not self._unsettled
-
-    def _ping(self, servo_id: int) -> bytes:
-        return self.form.build(servo_id, Instruction.PING)
 
     def _wire_ns(self, packet: bytes, servo_ids: Sequence[int], length: int) -> int:
         """Return the time of an instruction and its answers on the wire [ns]."""
@@ -311,7 +315,12 @@ class ServoLink:
         end_ns = self._sent_ns + round(1e9 * self.config.reply_timeout_s) + self._wire_ns(packet, servo_ids, length)
         answers = []
         for servo_id in servo_ids:
-            answer = self._receive(servo_id, length, end_ns)
+            # Any other answer is a late one to an earlier instruction; a refusal has no data.
+            while (answer := self._next_answer(end_ns)) is not None:
+                refused = not answer.data and answer.error & self.form.refusals
+                if answer.servo_id == servo_id and (len(answer.data) == length or refused):
+                    break
+                self._late += 1
             if answer is None:
                 return None
             answers.append(answer)
@@ -325,18 +334,6 @@ class ServoLink:
         self._sent_ns = self.clock.now_ns()
         self.port.write(packet)
 
-    def _receive(self, servo_id: int, length: int, end_ns: int) -> Answer | None:
-        """Return a servo's answer with `length` bytes of data, or its refusal without data.
-
-        All other answers are late ones to earlier instructions, and are dropped.
-        """
-        while (answer := self._next_answer(end_ns)) is not None:
-            refused = not answer.data and answer.error & self.form.refusals
-            if answer.servo_id == servo_id and (len(answer.data) == length or refused):
-                return answer
-            self._late += 1
-        return None
-
     def _next_answer(self, end_ns: int) -> Answer | None:
         """Return the next status packet with a correct checksum; None if there is none until `end_ns`."""
         while True:
@@ -346,34 +343,25 @@ class ServoLink:
                     return answer
             if not (data := self.port.read(end_ns)):
                 # A thread that wakes up late did not get the processor.
-                self._held_up_ns += max(0, self.clock.now_ns() - end_ns)
+                self._silence.held_up_ns += max(0, self.clock.now_ns() - end_ns)
                 return None
             self._waiting += [packet for packet, _ in self._parser.feed(data)]
 
-    def _count_answer(self, now_ns: int, wire_ns: int) -> int:
-        """Count an answer; return its delay beyond the time of its bytes on the wire [ns]."""
-        self._transactions += 1
-        late_ns = max(0, now_ns - self._sent_ns - wire_ns)
-        self._late_us.append(min(late_ns // 1000, 1 << 30))
-        self._late += late_ns > 1e9 * self.config.late_after_s
-        return late_ns
-
-    def _require_heard(self, what: str, silent_s: float) -> None:
-        if self._missed >= _MIN_LOSSES and silent_s > self.config.max_silence_s:
-            self._require_watching()
-            port, silent_ms = self.config.port, 1e3 * silent_s
-            missed = f"no answer to {what} on {port}: {self._missed} missed in a row, {silent_ms:.0f} ms"
-            if 1e-9 * self._held_up_ns > _BUSY_SHARE * silent_s:
-                raise HardwareLost(
-                    f"this computer is too busy: its control thread did not run for {1e-6 * self._held_up_ns:.0f} ms; "
-                    f"{missed}",
-                    hint="close what else runs on it, or raise servo_watchdog_s, which is also the longest silence",
-                )
+    def _require_heard(self, request: str) -> None:
+        """Raise HardwareLost if the bus has been silent for too long."""
+        silence = self._silence
+        silent_s, held_up_s = 1e-9 * (silence.end_ns - silence.begin_ns), 1e-9 * silence.held_up_ns
+        if silence.missed < _MIN_LOSSES or silent_s <= self.config.max_silence_s:
+            return
+        self._require_watching()
+        missed = f"no answer to {request} on {self.config.port}: {silence.missed} missed in a row"
+        missed += f", {1e3 * silent_s:.0f} ms"
+        if held_up_s > _BUSY_SHARE * silent_s:
             raise HardwareLost(
-                missed,
-                hint="check power, cable, ids and baud rate; is a USB adapter's latency timer longer than "
-                "reply_timeout_s?",
+                f"this computer is too busy: its control thread did not run for {1e3 * held_up_s:.0f} ms; {missed}",
+                hint="close what else runs on it, or raise servo_watchdog_s, which is also the longest silence",
             )
+        raise HardwareLost(missed, hint=f"check power, cable, ids and baud rate{self.port.advice}")
 
     def _require_watching(self) -> None:
         """Raise SafetyStop if the guardian has taken over: it reads answers that are then missing here."""

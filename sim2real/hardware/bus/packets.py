@@ -180,10 +180,3 @@ class Parser:
     def _drop(self, count: int) -> tuple[None, int]:
         del self._buffer[:count]
         return None, count
-
-
-def of_servos(servo_ids: Sequence[int]) -> str:
-    """Return the receivers of an instruction as a phrase for messages."""
-    if not servo_ids:
-        return ""
-    return f" of servo {servo_ids[0]}" if len(servo_ids) == 1 else f" of servos {tuple(servo_ids)}"

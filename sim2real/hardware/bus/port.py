@@ -72,7 +72,13 @@ class Line(Protocol):
 
 
 class Port(Line, Protocol):
-    """A line that is open alone."""
+    """A line that is open alone.
+
+    Attributes:
+        advice: What to look at if answers are missing or late, as the end of a hint.
+    """
+
+    advice: str
 
     def flush(self) -> None:
         """Drop the bytes that have arrived; OSError if the port is gone."""
@@ -123,6 +129,8 @@ class SerialPort(FdPort):
     Raises:
         HardwareLost: It cannot be opened, or another process uses it.
     """
+
+    advice = "; set a USB adapter's latency timer to 1 ms"
 
     def __init__(self, address: str, baud_rate: int) -> None:
         # Imported here: neither training nor an emulated robot in this process needs it.

@@ -509,8 +509,8 @@ class Servos(Device):
             raise HardwareLost(
                 f"servo {servo_id}{whose} does not answer on {self.config.port} at {self.config.baud_rate} baud. "
                 f"Available: {sorted(link.scan())}",
-                hint="check power, cable, id and baud rate; set a USB adapter's latency timer to 1 ms; two servos of "
-                "one id garble each other's answers: connect one at a time",
+                hint=f"check power, cable, id and baud rate{link.port.advice}; two servos of one id garble each "
+                "other's answers: connect one at a time",
             ) from error
         # Ping several times for a second servo of the same id: a late answer to an earlier ping does not repeat.
         ping, wait_s = link.form.build(servo_id, Instruction.PING), 2.0 * self.config.reply_timeout_s

@@ -120,7 +120,7 @@ def run(robot: RecordedRobot, config: DeployConfig, root: Path, run_dir: Path | 
         identification = None if identified is None else open_identification(identified.output("parameters"), robot)
         deployment = _deployed(robot, bundle, stage.folder, config, identification)
         summaries = deployment.summary
-        show_sessions(summaries, config.dry_run)
+        show_sessions(summaries, config.dry_run, config.port == "embedded")
         if config.dry_run:
             note("dry run: the robot did not move, so there is no gap report")
 

@@ -325,15 +325,16 @@ def timing_rows(summary: Mapping[str, Any]) -> tuple[list[list[Any]], list[str]]
     return rows, [*headers, "overruns"]
 
 
-def show_sessions(summaries: Sequence[Mapping[str, Any]], dry_run: bool) -> None:
+def show_sessions(summaries: Sequence[Mapping[str, Any]], dry_run: bool, embedded: bool) -> None:
     """Print the timing of the last session and the warnings of all; of a dry run the withheld commands, too."""
     print(table(*timing_rows(summaries[-1])))
     for summary in summaries:
         share = summary["late_replies"] / max(1, summary["transactions"])
         if share > LATE_SHARE:
+            adapter = "" if embedded else ", and set the latency timer of a USB adapter to 1 ms"
             note(
                 f"warning: {share:.1%} of the answers came late: when those samples were taken is not sure\n"
-                "hint: close what else runs on this computer, and set the latency timer of a USB adapter to 1 ms"
+                f"hint: close what else runs on this computer{adapter}"
             )
     if not dry_run:
         return
