@@ -24,10 +24,9 @@ from .mjcf import HINGE, STEP_S, mjcf_of
 from .model import HISTORY, Agent, Command, Measurement, PendulumParams, PendulumWorld, causes, dynamics, from_groups
 
 if TYPE_CHECKING:
-    from sim2real.hardware.device import Device, Reading
+    from sim2real.hardware.device import Device, Following, Reading
     from sim2real.hardware.dynamixel import DynamixelServos
     from sim2real.hardware.joint import Joint
-    from sim2real.hardware.safety.following import Following
     from sim2real.hardware.safety.gate import GateConfig, GateLimits
     from sim2real.hardware.safety.rig import Rig
     from sim2real.identification.export.mjcf import Late
@@ -163,7 +162,7 @@ class HingeModel(RobotModel):
         return from_groups(values, jnp.concatenate([jnp.asarray(x) for x in (start.position, start.velocity)]))
 
     def following(self, values: Mapping[str, float]) -> Following:
-        from sim2real.hardware.safety.following import Following
+        from sim2real.hardware.device import Following
 
         gain, gravity, damping, friction = (float(values[n]) for n in ("gain", "gravity", "damping", "friction"))
 

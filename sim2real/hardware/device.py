@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Final, Literal, Self, TypeAlias
@@ -16,7 +16,6 @@ from typing import Final, Literal, Self, TypeAlias
 import numpy as np
 
 from sim2real.hardware.clock import SYSTEM_CLOCK, Clock
-from sim2real.hardware.safety.following import Following
 
 
 @dataclass(frozen=True)
@@ -147,6 +146,54 @@ class OperatingMode(IntEnum):
     POSITION = 3
     EXTENDED_POSITION = 4
     PWM = 16
+
+
+RESPONSE_S: Final = 0.2
+"""Time in which every servo answers a small step [s]."""
+
+
+@dataclass(frozen=True)
+class Following:
+    """How the joints of a robot follow their commands, as far as that is certain.
+
+    Goals: ``response_s`` after a goal was sent, the joint is there, or travels there at ``speed_rad_s`` or faster. So
+    it lies between the goals of the last ``response_s``, or on the way to them, moved by ``weight``; it is away from
+    there by at most ``limit``.
+
+    Torques, if ``most_nm`` is given: the load that a motor reports is weaker than the torque of its law
+    ``tau + kp (q - position) + kd (dq - velocity)`` by at most ``limit``, on average over ``response_s``.
+
+    Pushes, if ``push`` is given: of the acceleration by its command a joint lacks at most the share ``limit``, in the
+    motion of the last ``response_s``.
+
+    Attributes:
+        limit: Largest deviation, one value or one per joint [rad, N m, or 1].
+        speed_rad_s: One value or one per joint.
+        source: Where the figures come from, for messages.
+        weight: Returns for positions ``(n,)`` by how much weight and dry friction move each joint off its goal, the
+            lowest and the highest value [rad]; None: ``limit`` includes that.
+        most_nm: Torque that each motor reaches, one value or one per joint; None: goals are compared.
+        push: Returns for positions, velocities and commands ``(n,)`` the acceleration of each joint without its
+            command, that by its command, and the largest one by dry friction [rad/s^2].
+        speeds: Returns for positions ``(n,)`` the speed of each joint towards smaller and towards larger angles, in
+            place of ``speed_rad_s`` [rad/s].
+        delay_s: Time from a command to the measurement that shows it, for pushes [s].
+    """
+
+    limit: float | Sequence[float] | np.ndarray
+    response_s: float
+    speed_rad_s: float | Sequence[float] | np.ndarray = 0.5
+    source: str = "the servos' own figures"
+    weight: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None
+    most_nm: float | Sequence[float] | np.ndarray | None = None
+    push: Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]] | None = None
+    speeds: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None
+    delay_s: float = 0.0
+
+    @property
+    def unit(self) -> str:
+        """Unit of `limit`."""
+        return "1" if self.push is not None else "rad" if self.most_nm is None else "N m"
 
 
 class Device(ABC):

@@ -34,9 +34,8 @@ from sim2real.types import Array, Key, PyTree, Scalar
 if TYPE_CHECKING:
     from sim2real.artifacts.identification import Noise
     from sim2real.emulation.robot import Emulation, VirtualTime
-    from sim2real.hardware.device import Device, Reading
+    from sim2real.hardware.device import Device, Following, Reading
     from sim2real.hardware.joint import Joint
-    from sim2real.hardware.safety.following import Following
     from sim2real.hardware.safety.gate import GateConfig, GateLimits
     from sim2real.hardware.safety.rig import Rig
     from sim2real.identification.export.mjcf import Late

@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sim2real.errors import SafetyStop
-from sim2real.hardware.safety.following import Following, FollowingCheck
+from sim2real.hardware.device import Following
+from sim2real.hardware.safety.following import FollowingCheck
 
 GATE = {"limit": 1.5, "slew_per_s": 20.0}
 START = np.array([0.5, -0.8, 0.3])

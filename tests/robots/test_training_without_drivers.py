@@ -18,9 +18,10 @@ prepare(pipeline, TrainConfig(model="nominal", episode_s=0.5, timelines=1), None
 print(json.dumps([n for n in sys.modules if n.startswith("sim2real.hardware.") and n.endswith((".device", ".drive"))]))
 """
 
-SAFETY = ("", ".safety", ".safety.limits", ".safety.following")
 TABLES = (
-    *SAFETY,
+    "",
+    ".safety",
+    ".safety.gate",
     ".device",  # the interface of a device
     ".bus",
     ".bus.registers",

@@ -5,19 +5,13 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final, TypeAlias
+from typing import Final
 
 import numpy as np
 
 from sim2real.errors import SafetyStop
+from sim2real.hardware.device import Following
 
-RESPONSE_S: Final = 0.2
-"""Time in which every servo answers a small step [s]."""
-SLOW_RAD_S: Final = 0.5
-"""Speed that every servo reaches on a longer way, also under load [rad/s]."""
-MOST_SHARE: Final = 0.9
-"""Share of its torque beyond which a servo that still does not reach its goal is stopped. With 0.7, 6 of 45 sound
-motions of an emulated SO-101 with payloads were stopped."""
 _BEYOND_S: Final = 0.04
 """Time for which a joint must be beyond its limit before the robot is stopped [s]."""
 _SAMPLES: Final = 3
@@ -31,53 +25,6 @@ _UNSURE: Final = 0.15
 """Share of the time between two measurements by which their times, or those of commands, may be uncertain."""
 _ENOUGH: Final = 3.0
 """Sum of the squares of a joint's changes of speed from which on they tell, against noise of 0.05 rad/s [rad^2/s^2]."""
-
-Push: TypeAlias = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
-Speed: TypeAlias = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-
-
-@dataclass(frozen=True)
-class Following:
-    """How the joints of a robot follow their commands, as far as that is certain.
-
-    Goals: ``response_s`` after a goal was sent, the joint is there, or travels there at ``speed_rad_s`` or faster. So
-    it lies between the goals of the last ``response_s``, or on the way to them, moved by ``weight``; it is away from
-    there by at most ``limit``.
-
-    Torques, if ``most_nm`` is given: the load that a motor reports is weaker than the torque of its law
-    ``tau + kp (q - position) + kd (dq - velocity)`` by at most ``limit``, on average over ``response_s``.
-
-    Pushes, if ``push`` is given: of the acceleration by its command a joint lacks at most the share ``limit``, in the
-    motion of the last ``response_s``.
-
-    Attributes:
-        limit: Largest deviation, one value or one per joint [rad, N m, or 1].
-        speed_rad_s: One value or one per joint.
-        source: Where the figures come from, for messages.
-        weight: Returns for positions ``(n,)`` by how much weight and dry friction move each joint off its goal, the
-            lowest and the highest value [rad]; None: ``limit`` includes that.
-        most_nm: Torque that each motor reaches, one value or one per joint; None: goals are compared.
-        push: Returns for positions, velocities and commands ``(n,)`` the acceleration of each joint without its
-            command, that by its command, and the largest one by dry friction [rad/s^2].
-        speeds: Returns for positions ``(n,)`` the speed of each joint towards smaller and towards larger angles, in
-            place of ``speed_rad_s`` [rad/s].
-        delay_s: Time from a command to the measurement that shows it, for pushes [s].
-    """
-
-    limit: float | Sequence[float] | np.ndarray
-    response_s: float
-    speed_rad_s: float | Sequence[float] | np.ndarray = 0.5
-    source: str = "the servos' own figures"
-    weight: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None
-    most_nm: float | Sequence[float] | np.ndarray | None = None
-    push: Push | None = None
-    speeds: Speed | None = None
-    delay_s: float = 0.0
-
-    @property
-    def unit(self) -> str:
-        """Unit of `limit`."""
-        return "1" if self.push is not None else "rad" if self.most_nm is None else "N m"
 
 
 @dataclass

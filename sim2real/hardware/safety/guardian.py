@@ -74,14 +74,18 @@ class Guard:
 
     def watch(self, link: int) -> None:
         """Act until the control process ends it, or dies."""
-        while True:
+        going = True
+        while going:
             due_s = self.due_s()
             wait_s = None if due_s is None else max(0.0, due_s - self._now_s())
             # Messages first: this process may be late itself.
             if not select.select([link], [], [], wait_s)[0]:
                 self.look()
-            elif not self.hear(_received(link)):
-                return
+                continue
+            messages = b""  # as of a control process that has died
+            with suppress(OSError):
+                messages = os.read(link, 4096)
+            going = self.hear(messages)
 
     def due_s(self) -> float | None:
         """Return the time at which the control process has been silent for too long [s]; None: never."""
@@ -97,14 +101,12 @@ class Guard:
 
     def hear(self, messages: bytes) -> bool:
         """Process messages of the control process; none: it has died. Return whether to go on."""
-        if messages.endswith(LEAVE):
+        if not messages and (self._armed or self._motors.at_rest):
+            self._make_safe("the control process is gone")
+        if not messages or messages.endswith(LEAVE):
             return False
         if TRIP in messages and not self._tripped:
             self._trip("the control process stopped the robot")
-        elif not messages:
-            if self._armed or self._motors.at_rest:
-                self._make_safe("the control process is gone")
-            return False
         else:
             self._armed, self._heard_s = messages.endswith(BEAT), self._now_s()
         return True
@@ -131,20 +133,6 @@ class Guard:
         return 1e-9 * self._motors.clock.now_ns()
 
 
-def _received(link: int) -> bytes:
-    """Return the control process' messages; empty if it has died."""
-    try:
-        return os.read(link, 4096)
-    except OSError:
-        return b""
-
-
-def _write(fd: int, message: bytes) -> None:
-    """Write to the control process or the terminal, if it still exists."""
-    with suppress(OSError):
-        os.write(fd, message)
-
-
 def main(link_fd: str, silence_s: str, place: str, *arguments: str) -> None:
     """Run until the control process ends."""
     module, _, name = place.partition(":")
@@ -162,28 +150,29 @@ def main(link_fd: str, silence_s: str, place: str, *arguments: str) -> None:
 
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGCONT)
     link, stderr = int(link_fd), 2
-    say, tell = partial(_write, link), lambda text: _write(stderr, f"{text}\n".encode())
-    Guard(motors, float(silence_s), say, tell).watch(link)
+
+    def write(fd: int, message: bytes) -> None:
+        with suppress(OSError):  # the control process or the terminal may not exist any more
+            os.write(fd, message)
+
+    Guard(motors, float(silence_s), partial(write, link), lambda text: write(stderr, f"{text}\n".encode())).watch(link)
     motors.close()
 
 
 class Channel(Protocol):
-    """The control process's end of the connection to a guardian."""
+    """The control process's end of the connection to a guardian.
+
+    `send` does not wait; it raises OSError if the guardian has died, or does not read. `receive` returns messages, None
+    if none come until a time [ns], or b"" if the guardian has died. `close` closes the connection, waits for the
+    guardian's end, and kills it after a time [s]; 0: it does not wait.
+    """
 
     pid: int
     clock: Clock
 
-    def send(self, message: bytes) -> None:
-        """Send a message, without waiting; OSError if the guardian has died, or does not read."""
-        ...
-
-    def receive(self, until_ns: int) -> bytes | None:
-        """Return messages; None if there are none until a time [ns]; b"" if the guardian has died."""
-        ...
-
-    def close(self, wait_s: float) -> None:
-        """Close the connection; then wait for the guardian's end, and kill it after a time [s]; 0: do not wait."""
-        ...
+    def send(self, message: bytes) -> None: ...
+    def receive(self, until_ns: int) -> bytes | None: ...
+    def close(self, wait_s: float) -> None: ...
 
 
 class Process:
@@ -249,8 +238,7 @@ class Process:
 class Guardian:
     """The control process's side: starts a guardian, sends it signs of life, and reads its messages.
 
-    In normal operation a guardian only receives signs of life from `beat`, which cost 10 us each: one that died is
-    noticed at the next one. It reports its actions on stderr.
+    A guardian that died is noticed at the next sign of life, which costs 10 us. It reports its actions on stderr.
 
     Args:
         start: Starts it, given the longest silence [s].

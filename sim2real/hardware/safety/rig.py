@@ -12,9 +12,9 @@ from typing import Final, Self
 import numpy as np
 
 from sim2real.errors import HardwareLost, SafetyStop, Sim2RealError, UsageError
-from sim2real.hardware.device import Device, Reading, Transaction
+from sim2real.hardware.device import Device, Following, Reading, Transaction
 from sim2real.hardware.joint import Joint, Mounting
-from sim2real.hardware.safety.following import Following, FollowingCheck
+from sim2real.hardware.safety.following import FollowingCheck
 from sim2real.hardware.safety.gate import GateConfig, SafetyGate
 from sim2real.hardware.safety.plausibility import Plausibility, require_parts
 

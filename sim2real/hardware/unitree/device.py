@@ -6,7 +6,7 @@ import os
 import sys
 import threading
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from types import MappingProxyType
@@ -21,12 +21,12 @@ from sim2real.hardware.device import (
     CommandKind,
     Counters,
     Device,
+    Following,
     Reading,
     ReadingPart,
     Transaction,
 )
 from sim2real.hardware.safety import guardian as guardians
-from sim2real.hardware.safety.following import Following
 from sim2real.hardware.safety.guardian import Guardian, Motors
 from sim2real.hardware.unitree.dds import LEASE_S, Address, DdsLink, StateStream, connect
 from sim2real.hardware.unitree.legs import NAMES, TORQUE_NM, LegDrive, command, motors_on, sit_down
@@ -94,8 +94,7 @@ class UnitreeLegs(Device):
         self._places = np.array(ids)
         self._damp = self.drive.damp()  # built here, as make_safe must not need any time
         self._clock: Clock = SYSTEM_CLOCK
-        self._robot: DdsLink | None = None
-        self._stream: StateStream | None = None
+        self._stream: StateStream | None = None  # the open connection
         self._guardian: Guardian | None = None
         self.armed = self.halted = False
         self._on = self._leaving = False
@@ -137,11 +136,11 @@ class UnitreeLegs(Device):
         return self._clock
 
     @property
-    def robot(self) -> DdsLink:
-        """The open connection; raise HardwareLost if it is not open."""
-        if self._robot is None:
+    def stream(self) -> StateStream:
+        """The states of the open connection; raise HardwareLost if it is not open."""
+        if self._stream is None:
             raise HardwareLost(f"the robot on {self.address} is not open", hint="call open first")
-        return self._robot
+        return self._stream
 
     @property
     def counters(self) -> Counters:
@@ -153,7 +152,7 @@ class UnitreeLegs(Device):
         Raises:
             HardwareLost: The interface does not exist, the robot is silent, or another program publishes commands.
         """
-        if self._robot is not None:
+        if self._stream is not None:
             raise UsageError("the robot is open already", hint="close it first")
         self.armed = self.halted = self._on = self._leaving = False
         self._published = 0
@@ -164,14 +163,10 @@ class UnitreeLegs(Device):
             # States must come, and no other writer may command the motors.
             stream = StateStream(robot, self._max_silence_s)
             state = stream.begin(_OPEN_S)
-            # Motors that are on have a program, perhaps one that is not discovered yet: to damp would lay it down.
-            end_s = self._now_s() + (_DISCOVERY_S if motors_on(state) else 0.0)
-            while not robot.other_writers() and self._now_s() < end_s:
-                self.clock.sleep(0.05)
-            # A program that was killed is a writer until its lease is over.
-            end_s = self._now_s() + LEASE_S + 1.0
-            while robot.other_writers() and self._now_s() < end_s:
-                self.clock.sleep(0.05)
+            # Motors that are on have a program, perhaps one that is not discovered yet: to damp would lay it down. A
+            # program that was killed is a writer until its lease is over.
+            self._wait(_DISCOVERY_S if motors_on(state) else 0.0, lambda: bool(robot.other_writers()))
+            self._wait(LEASE_S + 1.0, lambda: not robot.other_writers())
             _require_alone(robot, HardwareLost)
             # A program that was killed without a guardian may have left the motors on.
             if motors_on(state) and (failure := sit_down(robot, self.drive, _CONFIRM_S)):
@@ -179,7 +174,7 @@ class UnitreeLegs(Device):
         except BaseException:
             robot.close()
             raise
-        self._robot, self._stream = robot, stream
+        self._stream = stream
         atexit.register(self.close)
 
     def without_host(self) -> tuple[str, ...]:
@@ -188,7 +183,7 @@ class UnitreeLegs(Device):
 
     def facts(self) -> dict[str, dict[str, str]]:
         # Versions of 0 are those that the robot does not report.
-        record = self._next()[0].record
+        record = self.stream.next()[0].record
         bms = record["bms_state"]
         numbers = {"LowState": record["version"].tolist(), "battery": [bms["version_high"], bms["version_low"]]}
         versions = {name: ".".join(map(str, pair)) for name, pair in numbers.items() if any(pair)}
@@ -223,7 +218,7 @@ class UnitreeLegs(Device):
         self._beat()
         armed = self.armed
         try:
-            state, transaction = self._next()
+            state, transaction = self.stream.next()
         except HardwareLost:
             self.require_watching()
             raise
@@ -246,15 +241,16 @@ class UnitreeLegs(Device):
             if self.halted or not self.armed:
                 raise SafetyStop("no command is sent: the torque is off", hint="enable it, or open the robot again")
             self._beat()
-            self.robot.write(message)
-            self._stop_if_halted()
+            self.stream.robot.write(message)
+            if self.halted:  # `make_safe` takes no lock: this command may have followed it
+                self.make_safe()
             self._published += 1
             return Transaction(begin_ns, begin_ns - called_ns, self.clock.now_ns() - begin_ns, 0)
 
     def check(self) -> None:
         """Raise SafetyStop if another program publishes commands too."""
         if self.armed:
-            _require_alone(self.robot, SafetyStop)
+            _require_alone(self.stream.robot, SafetyStop)
 
     def require_watching(self) -> None:
         if self.armed and self._guardian is not None:
@@ -262,7 +258,7 @@ class UnitreeLegs(Device):
 
     def disable(self) -> None:
         """Let the legs damp until they are still, at most `LegDrive.lie_s`; then torque off, confirmed."""
-        robot, guardian = self.robot, self._guardian
+        robot, guardian = self.stream.robot, self._guardian
         with self._commanding:  # a command that is being published comes first
             self.armed = False
         if self._on and guardian is not None:
@@ -273,18 +269,19 @@ class UnitreeLegs(Device):
     def make_safe(self) -> None:
         """Let all motors damp now; the guardian takes their torque off when the robot lies. Never raises."""
         self.halted, self.armed = True, False
-        robot, guardian = self._robot, self._guardian
-        if robot is None or guardian is None or not self._on or self._leaving:
+        stream, guardian = self._stream, self._guardian
+        if stream is None or guardian is None or not self._on or self._leaving:
             return
         with suppress(Exception):
-            robot.write(self._damp)
+            stream.robot.write(self._damp)
         guardian.trip()
 
     def close(self) -> None:
         """Lay the robot down and disconnect. Never raises; if the motors do not confirm, the guardian goes on."""
-        robot, guardian = self._robot, self._guardian
-        if robot is None:
+        stream, guardian = self._stream, self._guardian
+        if stream is None:
             return
+        robot = stream.robot
         self.halted, self.armed = True, False
         # A command that is being published comes first; a signal handler may have interrupted it, so do not wait long.
         if self._commanding.acquire(timeout=_CONFIRM_S):
@@ -296,13 +293,13 @@ class UnitreeLegs(Device):
                 _LOGGER.error("the torque may be on: %s", failure)
             guardian.end(confirmed=not failure)
         robot.close()
-        self._robot = self._stream = self._guardian = None
+        self._stream = self._guardian = None
         self._on = False
         atexit.unregister(self.close)
 
     def _switch_on(self, message: LowCmd) -> None:
         """Start the guardian, and publish a command until a state shows every motor on."""
-        robot = self.robot
+        robot = self.stream.robot
         if self.halted:
             raise SafetyStop("torque stays off: the legs have been made safe", hint="open the robot again")
         # The guardian watches before the first command.
@@ -316,7 +313,7 @@ class UnitreeLegs(Device):
             try:
                 while not self.halted:
                     robot.write(message)
-                    off = set(NAMES) - set(motors_on(self._next()[0]))
+                    off = set(NAMES) - set(motors_on(self.stream.next()[0]))
                     if not off:
                         self.armed = True
                         break
@@ -327,7 +324,8 @@ class UnitreeLegs(Device):
                         )
                     self._guardian.beat()
             finally:
-                self._stop_if_halted()
+                if self.halted:
+                    self.make_safe()
 
     def _lie_down(self, robot: DdsLink, guardian: Guardian) -> str:
         """Lay the robot down, and return the failure or "". A guardian that has taken over lets it damp before."""
@@ -345,21 +343,15 @@ class UnitreeLegs(Device):
         self._on = bool(failure)
         return failure
 
-    def _next(self) -> tuple[LowState, Transaction]:
-        """Return the first state that arrives from now on, and its times."""
-        if self._stream is None or self._robot is None:
-            raise HardwareLost(f"the robot on {self.address} is not open", hint="call open first")
-        return self._stream.next()
-
     def _beat(self) -> None:
         """Give the guardian a sign of life; raise SafetyStop if it has taken over, or has died."""
         if self.armed and self._guardian is not None:
             self._guardian.beat()
 
-    def _stop_if_halted(self) -> None:
-        """Damp again after `make_safe`, as a command may have followed it."""
-        if self.halted:
-            self.make_safe()
+    def _wait(self, longest_s: float, until: Callable[[], bool]) -> None:
+        end_s = self._now_s() + longest_s
+        while not until() and self._now_s() < end_s:
+            self.clock.sleep(0.05)
 
     def _now_s(self) -> float:
         return 1e-9 * self.clock.now_ns()

@@ -18,7 +18,7 @@ import numpy as np
 
 from sim2real.arrays import beside_damping
 from sim2real.errors import UsageError
-from sim2real.hardware.safety.following import RESPONSE_S, Following
+from sim2real.hardware.device import RESPONSE_S, Following
 from sim2real.identification.export.mjcf import Late
 from sim2real.identification.export.plain import PlainSimulation, converged
 from sim2real.identification.parameters import Parameter
@@ -30,8 +30,8 @@ from sim2real.types import MjModel, MjSpec, PyTree, Scalar
 
 if TYPE_CHECKING:
     from sim2real.emulation.bus import BusEmulation
+    from sim2real.hardware.device import Following
     from sim2real.hardware.joint import Joint
-    from sim2real.hardware.safety.following import Following
     from sim2real.robots.servo.world import ServoParams, ServoState, ServoWorld
 
 mj: Any = mujoco

@@ -13,7 +13,7 @@ from sim2real.artifacts.identification import ROUND_TRIP
 from sim2real.artifacts.recording import TRUTH
 from sim2real.errors import DelayChanged, UsageError
 from sim2real.graph.episode import StepRecord
-from sim2real.hardware.safety.following import Following
+from sim2real.hardware.device import Following
 from sim2real.log.writer import McapRecorder
 from sim2real.policy.contract import PolicyContract
 from sim2real.policy.runner import BlendedRunner, Runner, UprightRunner

@@ -14,7 +14,7 @@ from sim2real.artifacts.identification import ROUND_TRIP, Identification
 from sim2real.artifacts.recording import TRUTH, Recording
 from sim2real.artifacts.run import StageFolder, finished, newest, open_stage, sha256
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.hardware.safety.following import Following
+from sim2real.hardware.device import Following
 from sim2real.installation import has_jax
 from sim2real.policy.contract import PolicyContract
 from sim2real.robots.robot import RecordedRobot, Robot, RobotAgent, in_world
