@@ -15,9 +15,8 @@ mj: Any = mujoco
 _RESPONDS = 1e-9
 """Share of the largest derivative below which a residual is independent of a column; decoupled derivatives are exactly
 0."""
-_TRUSTED = 0.7
-"""Largest error of the predicted change of the residuals, as a share of it, with which a Jacobian is corrected. With
-0.3, an arm's fit computed half as many more, for the same error on held-out recordings; with 1.5 it took more steps."""
+_TRUSTED = 0.3
+"""Largest error of the predicted change of the residuals, as a share of it, with which a Jacobian is corrected."""
 Stacked = Callable[[np.ndarray], np.ndarray]
 
 
