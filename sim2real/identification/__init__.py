@@ -8,6 +8,7 @@
     from sim2real.identification import predictions, uncertainty, verdict
     from sim2real.identification.config import FitConfig
     from sim2real.identification.fit import fit
+    from sim2real.identification.residuals import Problem
     from sim2real.identification.segments import Span
 
     LENGTH_S, SETTLE_S, HORIZON_S = 1.3, 0.3, 1.0
@@ -23,7 +24,7 @@
     spans = [Span(0, float(begin_s), begin_s < 0.75 * episode.duration_s) for begin_s in begins_s]
 
     # Search, then refine: the estimate is where the simulated segments differ least from the measured ones.
-    estimate = fit(model, [episode], spans, LENGTH_S, config)  # 4
+    estimate = fit(Problem(model, [episode], spans, LENGTH_S, config))  # 4
 
     # Linearise the residuals at the estimate: intervals follow from the derivatives, and which parameters the log
     # determines.

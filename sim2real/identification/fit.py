@@ -11,9 +11,6 @@ import numpy as np
 
 from sim2real.artifacts.identification import Search
 from sim2real.errors import Sim2RealError
-from sim2real.graph.episode import Episode
-from sim2real.identification.config import FitConfig
-from sim2real.identification.model import IdentifiableModel
 from sim2real.identification.parameters import ParameterTable
 from sim2real.identification.residuals import MOST_OF_FIT, Part, Problem, few_of, of_recordings, robust, thinned
 from sim2real.identification.search import SearchResult, search
@@ -122,30 +119,20 @@ def as_numbers(table: ParameterTable, x: np.ndarray, present: np.ndarray | None 
 
 
 def fit(
-    model: IdentifiableModel,
-    recordings: Sequence[Episode],
-    spans: Sequence[Span],
-    length_s: float,
-    config: FitConfig,
-    table: ParameterTable | None = None,
+    windows: Problem,
     long_spans: Sequence[Span] = (),
     report: OnProgress | None = None,
-    on_begin: Callable[[Problem], None] | None = None,
     end: np.ndarray | None = None,
 ) -> Fit:
     """Identify a model.
 
     Args:
-        spans: Segments to fit, and segments to predict.
-        length_s: Length of a segment [s].
-        long_spans: Segments of ``config.long_s`` for the last refinement.
+        windows: Segments to fit, and segments to predict.
+        long_spans: Segments of the configuration's ``long_s`` for the last refinement.
         end: Shape ``(P,)``: where a fit of nearly this model ended. Only the last refinement is made, from there: one
             on windows may leave a minimum that long segments have.
     """
-    windows = Problem(model, recordings, spans, length_s, config, table)
-    problem = thinned(windows, of_recordings(windows), MOST_OF_FIT)
-    if on_begin:
-        on_begin(problem)
+    config, problem = windows.config, thinned(windows, of_recordings(windows), MOST_OF_FIT)
     # Refine from the nominal values, too, with short and with long delays: a delay may imitate an inertia.
     starts, result = problem.table.starts() if end is None else end[None], None
     # Search globally; its best candidate is a further start of the refinement.

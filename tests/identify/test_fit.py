@@ -26,13 +26,13 @@ def episode():
 
 @pytest.fixture(scope="module")
 def found(episode):
-    return fit(Model(), [episode], spans(0), LENGTH_S, CONFIG, TABLE)
+    return fit(Problem(Model(), [episode], spans(0), LENGTH_S, CONFIG, TABLE))
 
 
 @pytest.mark.parametrize("model", [Model, OutsideModel])
 def test_the_parameters_are_found_with_honest_errors(episode, model):
     """Also of a world that calls back to Python, which JAX cannot differentiate."""
-    result = fit(model(), [episode], spans(0), LENGTH_S, CONFIG, TABLE)
+    result = fit(Problem(model(), [episode], spans(0), LENGTH_S, CONFIG, TABLE))
     assert result.converged
     assert result.left < 0.1
     spread = result.uncertainty()
@@ -54,7 +54,7 @@ def test_two_starts_end_with_one_loss(found, episode):
 def test_a_search_begins_a_descent_and_reports(episode, found):
     told = []
     config = replace(CONFIG, generations=6, population=4, strategy="SNES", refine_steps=8)
-    result = fit(Model(), [episode], spans(0), LENGTH_S, config, TABLE, report=lambda *what: told.append(what))
+    result = fit(Problem(Model(), [episode], spans(0), LENGTH_S, config, TABLE), report=lambda *what: told.append(what))
     assert result.loss == pytest.approx(found.loss, rel=1e-3)
     assert result.loss <= result.search.loss
     assert result.record.evaluations == 24
@@ -68,7 +68,7 @@ def test_a_search_begins_a_descent_and_reports(episode, found):
 @pytest.mark.parametrize(("low", "high"), [(0.25, 1.2), (2.2, 4.0)])
 def test_where_the_bounds_exclude_the_truth_the_fit_ends_at_one(episode, low, high):
     table = TABLE.with_nominal({"gain": (low + high) / 2}).with_bounds({"gain": (low, high)})
-    result = fit(Model(), [episode], spans(0), LENGTH_S, CONFIG, table)
+    result = fit(Problem(Model(), [episode], spans(0), LENGTH_S, CONFIG, table))
     assert result.values["gain"] == pytest.approx(high if high < GAIN else low, rel=0.02)
     assert result.uncertainty().verdict[0] == "at a bound"
 
@@ -76,7 +76,7 @@ def test_where_the_bounds_exclude_the_truth_the_fit_ends_at_one(episode, low, hi
 def test_a_friction_that_begins_at_its_lowest_value_comes_off_it(episode):
     """As at a bound the loss has a slope inwards."""
     rows = [replace(p, low=0.0, begin=0.0) if p.name == "bias" else p for p in TABLE]
-    result = fit(Model(), [episode], spans(0), LENGTH_S, CONFIG, ParameterTable(rows))
+    result = fit(Problem(Model(), [episode], spans(0), LENGTH_S, CONFIG, ParameterTable(rows)))
     assert result.values["bias"] == pytest.approx(BIAS, abs=0.01)
 
 
@@ -88,7 +88,7 @@ def test_from_where_another_fit_ended_only_the_last_refinement_is_made(episode, 
     )
     monkeypatch.setattr(fitting, "run_search", lambda *_: pytest.fail("nothing is searched for"))
     longer, end = [Span(0, 0.4 + 2.0 * i) for i in range(3)], found.x + 0.02
-    result = fit(Model(), [episode], spans(0), LENGTH_S, replace(CONFIG, long_s=2.0), TABLE, longer, end=end)
+    result = fit(Problem(Model(), [episode], spans(0), LENGTH_S, replace(CONFIG, long_s=2.0), TABLE), longer, end=end)
     assert cuts == [2.0]
     assert result.values["gain"] == pytest.approx(GAIN, rel=0.01)
 
@@ -96,7 +96,7 @@ def test_from_where_another_fit_ended_only_the_last_refinement_is_made(episode, 
 def test_what_nothing_determines_stays_near_its_nominal_value(episode):
     """Commands of one sign and size tell the gain and the bias only together."""
     still = replace(episode, outputs={**episode.outputs, "actuator": {"u": np.full(len(episode.steps["sensor"]), 0.5)}})
-    result = fit(Model(), [still], spans(0), LENGTH_S, CONFIG, TABLE)
+    result = fit(Problem(Model(), [still], spans(0), LENGTH_S, CONFIG, TABLE))
     assert "not determined" in result.uncertainty().verdict
 
 

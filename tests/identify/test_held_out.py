@@ -14,6 +14,7 @@ from sim2real.identification import held_out
 from sim2real.identification.fit import fit, refine, refit
 from sim2real.identification.held_out import Fold, folds_of, leave_out, moving
 from sim2real.identification.model import Channel
+from sim2real.identification.residuals import Problem
 from sim2real.identification.segments import Span
 
 
@@ -21,7 +22,7 @@ from sim2real.identification.segments import Span
 def one():
     """One log, fitted with all terms, and again without each of three parts."""
     episode = lag_log(0)
-    whole = fit(Model(), [episode], spans(0), LENGTH_S, CONFIG)
+    whole = fit(Problem(Model(), [episode], spans(0), LENGTH_S, CONFIG))
     parts = folds_of(whole.problem, 3)
     rows = leave_out(whole, parts, 0.2, free_run_s=20.0)
     return SimpleNamespace(episode=episode, fit=whole, parts=parts, rows=rows)
@@ -31,7 +32,7 @@ def test_a_part_that_is_left_out_might_as_well_not_have_been_recorded(one):
     for part, row in list(zip(one.parts, one.rows, strict=True))[:1]:
         rest = [s for s, gone in zip(spans(0), part.touches(spans(0), LENGTH_S), strict=True) if not gone]
         assert 4 <= len(rest) < len(spans(0))
-        alone = fit(Model(), [one.episode], rest, LENGTH_S, CONFIG).values
+        alone = fit(Problem(Model(), [one.episode], rest, LENGTH_S, CONFIG)).values
         for name in ("gain", "tau", "bias", "square"):
             spread = abs(alone[name] - one.fit.values[name])
             assert float(row.values[name]) == pytest.approx(alone[name], abs=0.02 * spread + 2e-5)
@@ -41,7 +42,7 @@ def test_fewer_parameters_are_estimated_as_by_a_table_that_holds_the_others(one)
     problem, names = one.fit.problem, one.fit.problem.table.names
     present = np.array([n in ("gain", "tau") for n in names])
     fixed = Model.parameters.with_fixed({"bias": 0.0, "square": 0.0})
-    alone = fit(Model(), [one.episode], spans(0), LENGTH_S, CONFIG, fixed)
+    alone = fit(Problem(Model(), [one.episode], spans(0), LENGTH_S, CONFIG, fixed))
     data = problem.part(present=present)
     ended = refine(problem, problem.table.start()[None], data)
     found = problem.table.decode(ended.x, present)
@@ -87,7 +88,7 @@ def test_errors_are_of_parts_in_which_the_joint_moves():
 def three():
     """Three logs, of which the last is of another robot: its input has 2.5 times the bias."""
     episodes = [lag_log(1), lag_log(2), lag_log(3, 2.5 * BIAS)]
-    whole = fit(Model(), episodes, [s for r in range(3) for s in spans(r)], LENGTH_S, CONFIG)
+    whole = fit(Problem(Model(), episodes, [s for r in range(3) for s in spans(r)], LENGTH_S, CONFIG))
     return whole, leave_out(whole, folds_of(whole.problem, 3), 0.2)
 
 

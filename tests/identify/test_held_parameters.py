@@ -11,6 +11,7 @@ from lag import GAIN, LENGTH_S, Model, Params, lag_log, spans
 from sim2real.identification import fit as fitting
 from sim2real.identification.fit import fit
 from sim2real.identification.parameters import Parameter, ParameterTable
+from sim2real.identification.residuals import Problem
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.identify.fitting import Fits, determined
 from sim2real.stages.identify.inputs import Inputs
@@ -41,7 +42,7 @@ def test_one_factor_of_a_product_is_held_and_the_other_is_for_that_value(long_s,
     longer = long_spans([episode], 1, config)
     assert bool(longer) == bool(long_s)
     model = Twice()
-    wide = fit(model, [episode], SPANS, LENGTH_S, config, long_spans=longer)
+    wide = fit(Problem(model, [episode], SPANS, LENGTH_S, config), long_spans=longer)
     found = Findings.of(wide, ())
     assert found.check.undetermined
     logs = (SimpleNamespace(episode=episode),)

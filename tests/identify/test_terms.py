@@ -8,6 +8,7 @@ from lag import BIAS, CONFIG, LENGTH_S, Model, lag_log, spans
 
 from sim2real.identification.fit import fit
 from sim2real.identification.held_out import folds_of
+from sim2real.identification.residuals import Problem
 from sim2real.identification.terms import Selection, TermSearch, Trial, gains
 
 
@@ -15,7 +16,7 @@ from sim2real.identification.terms import Selection, TermSearch, Trial, gains
 def search():
     """The search of three logs' terms: their input has a bias and no square."""
     episodes = [lag_log(seed) for seed in (1, 2, 3)]
-    whole = fit(Model(), episodes, [s for r in range(3) for s in spans(r)], LENGTH_S, CONFIG)
+    whole = fit(Problem(Model(), episodes, [s for r in range(3) for s in spans(r)], LENGTH_S, CONFIG))
     return SimpleNamespace(
         fit=whole, table=whole.problem.table,
         search=TermSearch(whole, folds_of(whole.problem, 3), 0.2, 2.0),

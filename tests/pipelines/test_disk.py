@@ -77,7 +77,7 @@ def fitted(synthetic):
     config = replace(PIPELINE.defaults.identify, generations=0, refine_steps=12, long_s=0.0)
     model, spans = PIPELINE.identifiable(MAX_DELAY_S), [Span(0, float(b)) for b in np.arange(0.3, 17.5, 2.0)]
     table = model.parameters.with_fixed({"swing": TRUTH["swing"]})
-    return fit(model, [synthetic.episode], spans, 2.0, config, table)
+    return fit(Problem(model, [synthetic.episode], spans, 2.0, config, table))
 
 
 @pytest.fixture(scope="module")

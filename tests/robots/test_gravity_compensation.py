@@ -11,6 +11,7 @@ from sim2real.identification import held_out, terms
 from sim2real.identification import problem as problems
 from sim2real.identification.fit import fit
 from sim2real.identification.held_out import folds_of
+from sim2real.identification.residuals import Problem
 from sim2real.identification.segments import Span
 from sim2real.identification.terms import TermSearch
 from sim2real.robots.model.parameters import ParameterPattern
@@ -52,7 +53,7 @@ def test_auto_finds_that_the_controller_carries_the_weight(recorded, monkeypatch
     model = offering(robot, "gravcomp").identifiable(0.02)
     table = model.parameters.with_terms(["gravcomp"])
     spans = [Span(0, begin) for begin in np.arange(0.2, SECONDS - 0.8, 0.6)]
-    widest = fit(model, [episode], spans, 0.6, config, table)
+    widest = fit(Problem(model, [episode], spans, 0.6, config, table))
     of_segment = 0.6 / STEP_S * (problems._BESIDE + 1) * len(widest.problem.table)
     monkeypatch.setattr(terms, "MOST_OF_SETS", kept * of_segment + 1)
     parts, sets = folds_of(widest.problem, 3), []

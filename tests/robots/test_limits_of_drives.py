@@ -11,6 +11,7 @@ from sim2real.artifacts.identification import Estimate, Identification, Judgemen
 from sim2real.identification.config import FitConfig
 from sim2real.identification.fit import fit
 from sim2real.identification.held_out import folds_of
+from sim2real.identification.residuals import Problem
 from sim2real.identification.segments import Span
 from sim2real.identification.terms import TermSearch
 from sim2real.identification.uncertainty import NOT_REACHED
@@ -50,7 +51,7 @@ def fitted(robot, episode, terms):
     model = offering(robot, terms).identifiable(0.02)
     table = with_wanted_terms(model.parameters.with_reached(model.reached([episode])), terms)
     spans = [Span(0, begin) for begin in np.arange(0.2, SECONDS - 0.8, 0.6)]
-    return fit(model, [episode], spans, 0.6, FitConfig(generations=0, max_delay_s=0.02), table)
+    return fit(Problem(model, [episode], spans, 0.6, FitConfig(generations=0, max_delay_s=0.02), table))
 
 
 BOTH = "torque_limit,speed_limit"

@@ -52,7 +52,7 @@ def test_logs_with_different_payloads_give_the_drive_of_all(tmp_path, engine):
     model = robot(tmp_path).identifiable(0.02)
     spans = [Span(r, begin) for r in (0, 1) for begin in np.arange(0.2, SECONDS - 0.8, 0.6)]
     config = FitConfig(generations=0, max_delay_s=0.02, engine=engine)
-    found = fit(model, [recorded(*load) for load in LOADS], spans, 0.6, config)
+    found = fit(Problem(model, [recorded(*load) for load in LOADS], spans, 0.6, config))
     assert found.values["kp"] == pytest.approx(KP, rel=0.005)
     assert found.values["damping"] == pytest.approx(DAMPING, rel=0.01)
     assert found.loss < 0.6  # 0.5 is noise

@@ -7,6 +7,7 @@ from recorded_on_c import play
 
 from sim2real.identification.config import FitConfig
 from sim2real.identification.fit import fit, refine
+from sim2real.identification.residuals import Problem
 from sim2real.identification.segments import Span
 from sim2real.robots.model.parameters import ParameterPattern, like_joints, sharing, usual_patterns
 from sim2real.robots.model.robot import MjcfRobot, RobotConfig
@@ -61,7 +62,7 @@ def test_a_joint_with_another_stiffness_gets_a_factor(recorded):
     model = robot.identifiable(0.02)
     spans = [Span(0, begin) for begin in np.arange(0.2, SECONDS - 0.8, 0.6)]
     table = with_wanted_terms(model.parameters, "kp_by_joint")
-    found = fit(model, [episode], spans, 0.6, FitConfig(generations=0, max_delay_s=0.02), table)
+    found = fit(Problem(model, [episode], spans, 0.6, FitConfig(generations=0, max_delay_s=0.02), table))
     # Without the factor, in the same programs.
     problem, shared = found.problem, np.array([name != "kp_of_lift_alone" for name in found.problem.table.names])
     assert not shared.all()

@@ -9,6 +9,7 @@ from recorded_on_c import play
 
 from sim2real.identification.config import FitConfig
 from sim2real.identification.fit import fit
+from sim2real.identification.residuals import Problem
 from sim2real.identification.segments import Span
 from sim2real.robots.model.parameters import ParameterPattern
 from sim2real.robots.model.robot import MjcfRobot, RobotConfig
@@ -36,7 +37,7 @@ def test_the_share_that_follows_the_voltage_is_found(tmp_path, share):
     config = RobotConfig(path, ("servo",), ("goal", "volts"), step_s=STEP_S, rate_hz=100.0, terms=terms)
     model = MjcfRobot(replace(config, sigma_rad=NOISE, volts_unit=VOLTS)).identifiable(0.02)
     spans = [Span(0, begin) for begin in np.arange(0.2, SECONDS - 0.8, 0.6)]
-    found = fit(model, [episode], spans, 0.6, FitConfig(generations=0, max_delay_s=0.02)).values
+    found = fit(Problem(model, [episode], spans, 0.6, FitConfig(generations=0, max_delay_s=0.02))).values
     assert found["voltage"] == pytest.approx(share, abs=0.05)
     assert found["kp"] == pytest.approx(KP, rel=0.02)
 

@@ -33,15 +33,15 @@ def pendulum():
 def interrupted(pipeline, root, monkeypatch, ending, told=True):
     """Identify, until a signal comes after two batches of generations; return the stage's folder."""
 
-    def fit(inputs, tell=None, begins=None, end=None):
-        own = inputs.table
+    def fit(windows, longer, tell, end):
+        own = windows.table
         for gain, loss in ((20.0, 3.0), (21.0, 1.0), (22.0, 2.0)):
             if told:
                 values = {p.name: gain if p.name == "gain" else p.high / 2 for p in own}
                 tell("search", 0.25, loss, own.encode(values))
         raise ending
 
-    monkeypatch.setattr(fitting, "fit_to", fit)
+    monkeypatch.setattr(fitting, "fit", fit)
     config = replace(pipeline.defaults.identify, log=(str(LOG),))
     with pytest.raises(type(ending)):
         identify_stage.run(pipeline, config, root, None)

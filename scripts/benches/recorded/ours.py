@@ -78,7 +78,7 @@ def identify(case: Case, fitted: Mapping[str, Episode]) -> ModelFit:
     longer = windows(episodes, c.long_s, 0.0, c.initial_state == "free") if c.long_s else []
     length = c.settle_s + c.horizon_s
     spans = windows(episodes, length, c.spacing_s, c.initial_state == "free")
-    return fit_model(case.model, episodes, spans, length, c, None, longer)
+    return fit_model(Problem(case.model, episodes, spans, length, c), longer)
 
 
 def windows(episodes: Sequence[Episode], length_s: float, spacing_s: float, estimated: bool) -> list[Span]:
@@ -161,13 +161,13 @@ def _fit_with_terms(case: Case, fitted: dict[str, Any]) -> Any:
     model, length = case.model, c.settle_s + c.horizon_s
     table = shared.with_wanted_terms(model.parameters, c.terms)
     spans = windows(episodes, length, c.spacing_s, c.initial_state == "free")
-    none = fit_model(model, episodes, spans, length, c, table.with_terms(()))
+    none = fit_model(Problem(model, episodes, spans, length, c, table.with_terms(())))
     problem = Problem(model, episodes, spans, length, c, table)
     selection = fitting.compare_terms(none, problem, c, list(fitted))
     fewer = table.with_terms(selection.chosen.names(table))
     end = fewer.encode(as_numbers(problem.table, selection.chosen.x))
     longer = shared.covering([(0.0, e.duration_s) for e in episodes], c.long_s or 0.0)
-    return fit_model(model, episodes, spans, length, c, fewer, longer, end=end)
+    return fit_model(Problem(model, episodes, spans, length, c, fewer), longer, end=end)
 
 
 def _model(fitted: Sequence[Recording], folder: Path) -> Path:

@@ -11,6 +11,7 @@ from sim2real.identification.fit import Fit, OnProgress, as_numbers, fit
 from sim2real.identification.held_out import MOST, Fold, HeldOutPart, folds_of, leave_out
 from sim2real.identification.parameters import ParameterTable
 from sim2real.identification.residuals import Linearised, Problem
+from sim2real.identification.segments import Span
 from sim2real.identification.terms import Selection, TermSearch, gains
 from sim2real.identification.uncertainty import ABSENT, NOT_REACHED, Determined, Uncertainty, above_noise, between_parts
 from sim2real.identification.uncertainty import determined as what_is_determined
@@ -71,7 +72,7 @@ def fit_model(inputs: Inputs, best: Best) -> Fits:
     config, auto = inputs.config, inputs.config.terms == "auto"
     base = with_terms(inputs, "none") if auto else inputs
     # Terms are compared on windows, which takes less time; long segments follow.
-    longer = bool(long_spans(inputs.episodes, inputs.fitted, config))
+    longer = bool(_long_spans(inputs))
     windows = replace(base, config=replace(config, long_s=0.0)) if longer else base
     whole = _fitted(windows, best, "identify")
     own, values, tried, added = whole.problem.table.terms, whole.values, (), ""
@@ -97,28 +98,25 @@ def fit_model(inputs: Inputs, best: Best) -> Fits:
 
 def _fitted(inputs: Inputs, best: Best, title: str, end: np.ndarray | None = None) -> Fit:
     """Return a fit that shows its progress."""
-
-    def on_begin(problem: Problem) -> None:
-        note(f"engine: {problem.engine}")
-        if (few := len(problem.train)) < (every := sum(span.fitted for span in inputs.windows)):
-            note(f"the fit takes {few} of {every} segments, those with most motion of each log; all are predicted")
-
     best.restart(inputs.table)
+    windows = windows_of(inputs)
+    note(f"engine: {windows.engine}")
     with _progress(title, best) as report:
-        return patiently(lambda: fit_to(inputs, report, on_begin, end))
+        found = patiently(lambda: fit(windows, _long_spans(inputs), report, end))
+    few, every = len(found.problem.train), len(windows.train)
+    if few < every and found.problem.segment_s == windows.segment_s:
+        note(f"the fit takes {few} of {every} segments, those with most motion of each log; all are predicted")
+    return found
 
 
-def fit_to(
-    inputs: Inputs,
-    report: OnProgress | None = None,
-    on_begin: Callable[[Problem], None] | None = None,
-    end: np.ndarray | None = None,
-) -> Fit:
-    """Return the fit of a model to its logs; arguments as of ``fit``."""
-    config = inputs.config
-    longer, length_s = long_spans(inputs.episodes, inputs.fitted, config), config.settle_s + config.horizon_s
-    data = (inputs.model, inputs.episodes, inputs.windows, length_s, config, inputs.table, longer)
-    return fit(*data, report=report, on_begin=on_begin, end=end)
+def windows_of(inputs: Inputs) -> Problem:
+    """Return the segments of an identification."""
+    length_s = inputs.config.settle_s + inputs.config.horizon_s
+    return Problem(inputs.model, inputs.episodes, inputs.windows, length_s, inputs.config, inputs.table)
+
+
+def _long_spans(inputs: Inputs) -> list[Span]:
+    return long_spans(inputs.episodes, inputs.fitted, inputs.config)
 
 
 def _compared(inputs: Inputs, own: Fit, on_set: Callable[[str], None]) -> tuple[ParameterTable, Selection] | None:
@@ -129,9 +127,8 @@ def _compared(inputs: Inputs, own: Fit, on_set: Callable[[str], None]) -> tuple[
     more = with_terms(inputs, ",".join(["auto", *terms]), "all")
     if not set(more.table.terms) - set(terms) or not set(own.values) <= {p.name for p in more.table}:
         return None
-    config, length_s = inputs.config, inputs.config.settle_s + inputs.config.horizon_s
-    problem = Problem(more.model, inputs.episodes, inputs.windows, length_s, config, more.table)
-    return problem.table, compare_terms(own, problem, config, inputs.names, on_set)
+    problem = windows_of(more)
+    return problem.table, compare_terms(own, problem, inputs.config, inputs.names, on_set)
 
 
 def compare_terms(
@@ -180,7 +177,8 @@ def determined(fits: Fits, check: Determined, spread: Uncertainty) -> tuple[Fits
         tried.add(name)
         held = estimate.problem.table.with_fixed({name: table[name].nominal})
         end = estimate.x[[c.name != name for c in estimate.problem.table.columns]]
-        again = fit_to(replace(inputs, table=held), end=end)
+        own = replace(inputs, table=held)
+        again = fit(windows_of(own), _long_spans(own), end=end)
         if not again.converged or again.loss > (1.0 + _AS_GOOD) * estimate.loss:
             continue
         estimate = again

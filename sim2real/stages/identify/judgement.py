@@ -42,7 +42,7 @@ from sim2real.identification.uncertainty import widening as posterior_widening
 from sim2real.identification.verdict import ACCEPTED, state_of
 from sim2real.log.importing.checks import slow_sides
 from sim2real.stages.identify.config import IdentifyConfig
-from sim2real.stages.identify.fitting import Fits, determined, has_parts, widened, without_parts
+from sim2real.stages.identify.fitting import Fits, determined, has_parts, widened, windows_of, without_parts
 from sim2real.stages.identify.inputs import Inputs, configured, with_load, with_terms
 from sim2real.stages.identify.true_values import true_values
 from sim2real.stages.load import defaults_of
@@ -310,8 +310,7 @@ def tilted(inputs: Inputs, fit: Fit) -> Problem | None:
     more = with_terms(inputs, wanted, bounds=dict.fromkeys(turns, (-math.pi, math.pi)))
     if not set(fit.values) <= {p.name for p in more.table}:
         return None
-    length_s = config.settle_s + config.horizon_s
-    return few_of(Problem(more.model, inputs.episodes, inputs.windows, length_s, config, more.table))
+    return few_of(windows_of(more))
 
 
 def _judged(
