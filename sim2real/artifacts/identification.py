@@ -122,20 +122,6 @@ class Noise:
         return name, None if index is None else int(index)
 
 
-@dataclass(frozen=True)
-class Search:
-    """The search for the estimate.
-
-    Attributes:
-        evaluations: Number of simulated candidates.
-        engine: The simulator, and the reason for its choice.
-    """
-
-    evaluations: int = 0
-    seconds: float | None = None
-    engine: str = ""
-
-
 Outcome = Literal["chosen", "mends", "no gain", "not reached", "not fitted"]
 
 
@@ -446,7 +432,6 @@ class Identification(Shown):
     logs: tuple[Source, ...]
     verdict: Judgement
     parameters: tuple[Estimate, ...]
-    search: Search = field(default_factory=Search)
     errors: tuple[ComparedError, ...] = ()
     expected_error: tuple[ExpectedError, ...] = ()
     worst: WorstSecond | None = None

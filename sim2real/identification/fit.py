@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sim2real.artifacts.identification import Search
 from sim2real.errors import Sim2RealError
 from sim2real.identification.parameters import ParameterTable
 from sim2real.identification.residuals import MOST_OF_FIT, Part, Problem, few_of, of_recordings, robust, thinned
@@ -97,11 +96,6 @@ class Fit:
     def values(self) -> dict[str, float]:
         """The estimate by name."""
         return as_numbers(self.problem.table, self.x)
-
-    @property
-    def record(self) -> Search:
-        """How search and refinement went, for the artifact."""
-        return Search(self.search.evaluations if self.search else 0, engine=str(self.problem.engine))
 
     def uncertainty(self) -> Uncertainty:
         """Return how uncertain the estimate is."""

@@ -91,7 +91,7 @@ def identify_banner(result: Identification) -> Banner | None:
 
 
 def _tiles(result: Identification) -> Iterator[Tile]:
-    """Yield the worst position, the delays, the residuals and the search."""
+    """Yield the worst position and the delays."""
     for row in result.held_out[:1]:
         which = f"{row.name}, the worst of {len(result.held_out)}," if len(result.held_out) > 1 else row.name
         note = ", ".join(f"{m} {number(e, 3)}" for m, e in row.baselines.items())
@@ -102,10 +102,6 @@ def _tiles(result: Identification) -> Iterator[Tile]:
             error = "" if e.standard_error is None else f" ± {1e3 * e.standard_error:.1f}"
             truth = "" if e.truth is None else f"truth {1e3 * e.truth:.1f} ms"
             yield Tile(e.name.replace("_", " "), f"{1e3 * e.estimate:.1f}{error} ms", truth)
-    seconds, evaluations = result.search.seconds, result.search.evaluations
-    if seconds is not None:
-        simulated = [f"{number(evaluations)} evaluations" if evaluations else "", result.search.engine]
-        yield Tile("search", f"{float(seconds):.0f} s", "; ".join(filter(None, simulated)))
 
 
 # -- the worst second

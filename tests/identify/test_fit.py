@@ -57,7 +57,7 @@ def test_a_search_begins_a_descent_and_reports(episode, found):
     result = fit(Problem(Model(), [episode], spans(0), LENGTH_S, config, TABLE), report=lambda *what: told.append(what))
     assert result.loss == pytest.approx(found.loss, rel=1e-3)
     assert result.loss <= result.search.loss
-    assert result.record.evaluations == 24
+    assert result.search.evaluations == 24
     for stage in ("search", "refine"):
         shares = [share for name, share, *_ in told if name == stage]
         assert shares

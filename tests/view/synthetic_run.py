@@ -108,7 +108,6 @@ def parameters(truth: bool = True) -> dict[str, Any]:
             "names": names, "transform": ["linear"] * 3, "mean": [0.0] * 3, "low": [-9.0] * 3, "high": [9.0] * 3,
             "covariance": (np.eye(3) * 0.5 + 0.5).tolist(),
         },
-        "search": {"evaluations": 1920, "seconds": 12.3},
         "errors": [
             {
                 "source": "held-out data", "name": n, "column": f, "unit": "rad", "kind": "ahead", "seconds": 1.0,

@@ -207,7 +207,7 @@ def test_one_seed_and_missing_numbers_are_shown(only):
     run = only("identify", "train")
     (run / "train" / "history.json").write_text(json.dumps({**synthetic_run.history(1), "best_seed": 0}))
     data = synthetic_run.parameters(truth=False)
-    for name in ("posterior", "search", "aggregate"):
+    for name in ("posterior", "aggregate"):
         del data[name]
     data |= {"verdict": {"status": "", "reasons": []}, "logs": []}
     (run / "identify" / "parameters.json").write_text(json.dumps(data))

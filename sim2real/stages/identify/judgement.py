@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -58,12 +57,8 @@ _MOST = 3
 """Most errors above the expected ones that are named."""
 
 
-def judge(fits: Fits, started_s: float) -> Identification:
-    """Return the estimates with intervals, predictions, free runs and a verdict; the caller adds logs and timing.
-
-    Args:
-        started_s: When the fit began [s on ``time.monotonic``].
-    """
+def judge(fits: Fits) -> Identification:
+    """Return the estimates with intervals, predictions, free runs and a verdict; the caller adds logs and timing."""
     inputs, config = fits.inputs, fits.inputs.config
     with progress(None, "identify: held-out parts") as bar:
         # Refit without each part of the recordings.
@@ -78,7 +73,7 @@ def judge(fits: Fits, started_s: float) -> Identification:
         fit = findings.fit
         truth = true_values(inputs.logs[0])
         posterior = fit.problem.table.posterior(fit.x, findings.spread.scale_covariance)
-        document = _estimates(inputs.loaded.name, findings, posterior, truth, time.monotonic() - started_s)
+        document = _estimates(inputs.loaded.name, findings, posterior, truth)
         # Predict held-out data, beside baselines.
         bar.set_description_str("identify: predictions and baselines")
         document = patiently(lambda: _predicted(document, inputs, fit))
@@ -140,19 +135,14 @@ class Findings:
         return Findings(replace(fit, x=x), replace(at, x=x), spread, check, posterior_widening(at, spread))
 
 
-def _estimates(
-    pipeline: str, findings: Findings, posterior: Posterior, truth: Mapping[str, float], seconds: float
-) -> Identification:
+def _estimates(pipeline: str, findings: Findings, posterior: Posterior, truth: Mapping[str, float]) -> Identification:
     """Return the estimates with their uncertainty; predictions and verdict are added later.
 
     Args:
         truth: Known parameters of the embedded robot.
-        seconds: Duration of the search [s].
     """
-    fit = findings.fit
-    search = replace(fit.record, seconds=seconds)
-    rows = tuple(_rows(findings, truth))
-    document = Identification(pipeline, (), Judgement("", ()), rows, search)
+    fit, rows = findings.fit, tuple(_rows(findings, truth))
+    document = Identification(pipeline, (), Judgement("", ()), rows)
     if not fit.converged:  # away from a minimum no interval means anything
         return replace(document, parameters=tuple(map(_without_interval, rows)))
     return replace(document, posterior=posterior, widening=findings.widening)

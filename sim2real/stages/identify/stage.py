@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import shlex
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from sim2real.artifacts.files import number
 from sim2real.artifacts.identification import (
     PARAMETERS,
     ROUND_TRIP,
@@ -82,11 +80,10 @@ def identify(
 
 
 def _identify(inputs: Inputs, best: Best) -> Identification:
-    started_s = time.monotonic()
     # Fit, then write the fit down before it is judged, which takes longer than the fit.
     fits = fit_model(inputs, best)
     best.fitted(fits.estimate.x, fits.estimate.loss)
-    identification = judge(fits, started_s)
+    identification = judge(fits)
     return replace(
         identification,
         logs=inputs.sources(),
@@ -167,7 +164,7 @@ def show(identification: Identification) -> None:
 
 def summary(identification: Identification) -> dict[str, str]:
     """Return the lines that the console shows at the end: name -> text."""
-    logs, search = identification.logs, identification.search
+    logs = identification.logs
     lines = {"log": logs[0].path if len(logs) == 1 else f"{len(logs)} logs, the first {logs[0].path}"}
     if total := next((p for p in identification.parameters if p.name == ROUND_TRIP), None):
         lines["round trip delay"] = f"{1e3 * total.estimate:.1f} ms"
@@ -176,7 +173,6 @@ def summary(identification: Identification) -> dict[str, str]:
         lines["error on held-out data"] = f"{worst.name} {size} {worst.seconds:.3g} s ahead"
     lines["expected error"] = identification.outlook()
     lines["verdict"] = identification.verdict.status
-    lines["search"] = f"{search.evaluations} candidates in {number(search.seconds):.0f} s"
     return lines
 
 
