@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from recorded_on_c import play
 
-from sim2real.identification import held_out, terms
-from sim2real.identification import problem as problems
+from sim2real.identification import held_out, residuals, terms
 from sim2real.identification.fit import fit
 from sim2real.identification.held_out import folds_of
 from sim2real.identification.residuals import Problem
@@ -54,7 +53,7 @@ def test_auto_finds_that_the_controller_carries_the_weight(recorded, monkeypatch
     table = model.parameters.with_terms(["gravcomp"])
     spans = [Span(0, begin) for begin in np.arange(0.2, SECONDS - 0.8, 0.6)]
     widest = fit(Problem(model, [episode], spans, 0.6, config, table))
-    of_segment = 0.6 / STEP_S * (problems._BESIDE + 1) * len(widest.problem.table)
+    of_segment = 0.6 / STEP_S * (residuals._BESIDE + 1) * len(widest.problem.table)
     monkeypatch.setattr(terms, "MOST_OF_SETS", kept * of_segment + 1)
     parts, sets = folds_of(widest.problem, 3), []
     search = TermSearch(widest, parts, config.settle_s, config.free_run_s, sets.append)
