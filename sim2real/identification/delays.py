@@ -12,7 +12,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.interpolate import BSpline
 
 from sim2real.artifacts.identification import Link, Ranged
 from sim2real.errors import UsageError
@@ -89,6 +88,8 @@ class Likelihood:
     """
 
     def __init__(self, evidence: DelayEvidence, grid: np.ndarray) -> None:
+        from scipy.interpolate import BSpline  # 0.6 s of each identification, which need not estimate links
+
         self.evidence, self.grid = evidence, grid
         self.fields, self.unknowns = evidence.jacobian.shape[1:]
         knots = np.concatenate([np.zeros(3), np.linspace(0.0, 1.0, _BUMPS - 1), np.ones(3)])
