@@ -135,7 +135,7 @@ def test_a_mounting_changes_nothing_that_is_seen_of_the_joints(kind, rows, seed)
 @given(rows=mountings)
 def test_a_joint_that_is_too_fast_is_stopped_whatever_its_gear(rows):
     seen, why, _ = compare(VOLTAGE, rows, np.full((60, N), [1.1, 0.0]), gate_of(VOLTAGE, max_speed_rad_s=0.5))
-    assert "joint 0 is beyond the limit of 0.5 rad/s" in why
+    assert "joint 'motor 0' is beyond the limit of 0.5 rad/s" in why
     assert 0.3 < seen[-1, N] < 0.5
 
 

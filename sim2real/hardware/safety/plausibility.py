@@ -53,6 +53,7 @@ class Plausibility:
 
     def __init__(self, config: GateConfig) -> None:
         self._config = config
+        self._fastest = np.asarray(np.inf if config.max_speed_rad_s is None else config.max_speed_rad_s, np.float64)
         self.reset()
 
     def reset(self) -> None:
@@ -101,8 +102,6 @@ class Plausibility:
         # Of each joint [rad/s]: before it stood still, and between the last two samples.
         self._speed, self._before = np.zeros(n), np.zeros(n)
         self._since_s, self._same = np.full(n, t_s), np.zeros(n, np.int64)
-        fastest = np.inf if self._config.max_speed_rad_s is None else self._config.max_speed_rad_s
-        self._fastest = np.broadcast_to(np.asarray(fastest, np.float64), n)
 
     def _require_finite(self, position_rad: np.ndarray) -> None:
         """Refuse values that are no numbers, which pass every comparison."""
@@ -126,7 +125,7 @@ class Plausibility:
             )
 
     def _require_reachable(self, position_rad: np.ndarray, elapsed_s: float) -> None:
-        limit = self._fastest
+        limit = np.broadcast_to(self._fastest, position_rad.shape)
         most = reach_rad(limit, elapsed_s)
         leap = np.abs(position_rad - self._position)
         if (leap > most).any():

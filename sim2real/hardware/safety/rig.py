@@ -84,6 +84,7 @@ class Rig:
             )
         self._mounting = Mounting(joints, device)
         self.device = device
+        gate = gate if gate.joints else replace(gate, joints=device.motors)
         self.gate = SafetyGate(gate)
         self._plausibility = Plausibility(gate)
         self.following: Following | None = None
@@ -112,7 +113,10 @@ class Rig:
         self.clock = device.clock
         try:
             self._require_reach()
-            self.following = self._follows()
+            following, gear = device.following(), self._mounting.gear
+            if following is not None and following.most_nm is None:
+                following = replace(following, limit=following.limit / gear, speed_rad_s=following.speed_rad_s / gear)
+            self.follow(following)
         except BaseException:
             device.close()
             raise
@@ -155,7 +159,8 @@ class Rig:
                 self._sent = self.gate.fallback
                 self._follow_check = None
                 if self.following is not None and not self.torque_withheld:
-                    self._follow_check = FollowingCheck(self.following, self._sent, self._now_s(), self._name)
+                    name = self.gate.config.joint
+                    self._follow_check = FollowingCheck(self.following, self._sent, self._now_s(), name)
                 self._is_first = True
                 self._on = True
                 if not self.torque_withheld:
@@ -237,9 +242,15 @@ class Rig:
             self._follow_check.check(reading.position_rad, reading.velocity_rad_s, reading.load, sampled_s, late_s)
         return reading
 
-    def follow(self, following: Following) -> None:
-        """Check from the next `start` on whether the joints follow as an identified model says; see `following`."""
-        self.following = self._limited(following)
+    def follow(self, following: Following | None) -> None:
+        """Check from the next `start` on whether the joints follow as an identified model says; see `following`.
+
+        The limit that the user has set takes the place of the model's; an infinite one ends the check.
+        """
+        limit = self.gate.config.following_rad
+        if following is not None and following.unit == "rad" and limit is not None:
+            following = replace(following, limit=limit, source="following_rad")
+        self.following = None if limit is not None and np.all(np.isinf(limit)) else following
 
     def hand_over(self) -> None:
         """Treat the next command as the first of its sender: it must be near the measured pose, see `command`."""
@@ -351,30 +362,6 @@ class Rig:
         columns = np.stack([here if unit == "rad" else np.zeros_like(here) for unit in units], axis=-1)
         return self.gate.config.at_rest(columns if self.gate.config.has_columns else columns[:, 0])
 
-    def _follows(self) -> Following | None:
-        """Return how the joints follow their commands, by the device's own figures."""
-        following = self.device.following()
-        if following is None:
-            return None
-        if following.most_nm is None:
-            gear = self._mounting.gear
-            following = replace(following, limit=following.limit / gear, speed_rad_s=following.speed_rad_s / gear)
-        return self._limited(following)
-
-    def _limited(self, following: Following) -> Following | None:
-        """Return how the joints follow their commands, with the limit that the user has set."""
-        limit = self.gate.config.following_rad
-        if limit is None:
-            return following
-        if np.all(np.isinf(limit)):
-            return None
-        return replace(following, limit=limit, source="following_rad") if following.unit == "rad" else following
-
-    def _name(self, index: int) -> str:
-        """Return a joint's name for errors; without one, its motor's."""
-        named = index < len(self.gate.config.joints)
-        return self.gate.config.joint(index) if named else self.device.motors[index]
-
     def _require_near(self, command: np.ndarray) -> None:
         """Refuse a sender whose first goals are far away from the measured pose."""
         if not self._is_first:
@@ -391,7 +378,7 @@ class Rig:
         if np.any(away > most):  # the gate refuses a command that is no number
             worst = int(np.nanargmax(away - most))
             raise SafetyStop(
-                f"the first command puts {self._name(worst)} at {wanted[worst]:.3g} rad, measured are "
+                f"the first command puts {self.gate.config.joint(worst)} at {wanted[worst]:.3g} rad, measured are "
                 f"{here[worst]:.3g} rad: {away[worst]:.2g} rad away, {most[worst]:.2g} rad are allowed",
                 hint="bring the robot to the pose in which the policy starts; first_step_rad sets the limit",
             )
