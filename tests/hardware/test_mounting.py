@@ -143,7 +143,7 @@ def test_a_joint_that_is_too_fast_is_stopped_whatever_its_gear(rows):
 @given(rows=mountings)
 def test_a_leap_of_a_joint_is_one_whatever_its_gear(rows):
     seen, why, _ = compare(VOLTAGE, rows, np.zeros((20, N)), leap_at=8)
-    assert "joint 1 reads 2.8 rad, 3 rad from the last reading" in why
+    assert "joint 'motor 1' reads 2.8 rad, 3 rad from the last reading" in why
     assert len(seen) == 7
 
 
