@@ -1,14 +1,12 @@
-"""Emulated DYNAMIXEL X servos: what their firmware adds to the table, and their bus."""
+"""Emulated DYNAMIXEL X servos: what their firmware adds to the table."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Final
 
-from sim2real.emulation.bus import BusEmulation, Request
-from sim2real.emulation.servos import ServoBus, ServoFirmware
+from sim2real.emulation.servos import ServoEmulation, ServoFirmware
 from sim2real.hardware import dynamixel as reg
-from sim2real.hardware.bus.packets import Instruction
 from sim2real.hardware.bus.registers import Register
 from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.dynamixel import ALERT_BIT, StatusError
@@ -27,6 +25,9 @@ class EmulatedServo(ServoFirmware):
     fixed = (reg.ID, reg.BAUD_RATE, reg.DRIVE_MODE)
     homing = reg.HOMING_OFFSET
     atomic = True
+    wild_counts = (1 << 24, 1 << 31)
+    answers_together = True
+    misunderstandings = (StatusError.CRC, StatusError.INSTRUCTION, StatusError.DATA_LENGTH)
 
     def __init__(
         self,
@@ -123,28 +124,8 @@ class EmulatedServo(ServoFirmware):
         return False
 
 
-class EmulatedBus(ServoBus[EmulatedServo, "EmulatorConfig"]):
-    """Emulated DYNAMIXEL servos on a bus, driving a plant; see `ServoBus`."""
-
-    family = reg.FAMILY
-    wild_counts = (1 << 24, 1 << 31)
-
-    def make_servo(self, servo_id: int, config: EmulatorConfig) -> EmulatedServo:
-        return EmulatedServo(servo_id, config.model_number, config.return_delay_us, config.watchdog_stops)
-
-    def execute(self, request: Request) -> None:
-        if request.packet.code != Instruction.STATUS:
-            super().execute(request)
-
-    def _misunderstand(self, servo: EmulatedServo, request: Request) -> None:
-        self._answer(servo, request, StatusError.INSTRUCTION if request.packet.intact else StatusError.CRC)
-
-    def _misread(self, servo: EmulatedServo, request: Request) -> None:
-        self._confirm(servo, request, StatusError.DATA_LENGTH)
-
-
 @dataclass(frozen=True)
-class EmulatorConfig(BusEmulation):
+class EmulatorConfig(ServoEmulation):
     """Settings of emulated DYNAMIXEL servos on their bus; see `Emulation` for the others.
 
     Args:
@@ -152,7 +133,8 @@ class EmulatorConfig(BusEmulation):
         watchdog_stops: Whether a tripped bus watchdog stops the motor; None: as in the model's firmware.
     """
 
-    bus_type = EmulatedBus
-
     model_number: int = 1060
     watchdog_stops: bool | None = None
+
+    def servo(self, servo_id: int) -> EmulatedServo:
+        return EmulatedServo(servo_id, self.model_number, self.return_delay_us, self.watchdog_stops)

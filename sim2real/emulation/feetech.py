@@ -1,12 +1,11 @@
-"""Emulated Feetech servos: what their firmware adds to the table, and their bus."""
+"""Emulated Feetech servos: what their firmware adds to the table."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 
-from sim2real.emulation.bus import BusEmulation, Request
-from sim2real.emulation.servos import ServoBus, ServoFirmware
+from sim2real.emulation.servos import ServoEmulation, ServoFirmware
 from sim2real.hardware import feetech as reg
 from sim2real.hardware.bus.registers import Register
 from sim2real.hardware.device import OperatingMode
@@ -17,7 +16,8 @@ class StsServo(ServoFirmware):
 
     A value out of range is dropped without an error, as its status packets carry none; so is a write to a read-only
     register. EEPROM registers accept writes at any time; a value that was written while Lock is 1 is lost at the next
-    restart. Goals beyond the position limits are cut to them.
+    restart. Goals beyond the position limits are cut to them. An instruction with a wrong checksum gets no answer, as
+    the protocol has no error for it; nor a broadcast ping of several servos, whose answers would collide.
 
     Two assumptions, not measured by us, are the worse case for a driver: writing a goal switches the torque on
     (`goal_wakes`), and after an alarm the motor is off while the torque register still holds 1. Not emulated: the
@@ -91,52 +91,24 @@ class StsServo(ServoFirmware):
         self.put(reg.TORQUE_LIMIT, self.get(reg.MAX_TORQUE))
 
 
-class StsBus(ServoBus[StsServo, "StsEmulation"]):
-    """Emulated STS3215 servos on a bus, driving a plant; see `ServoBus`.
-
-    They do not answer an instruction with a wrong checksum, for which the protocol has no error; nor several servos a
-    broadcast ping, as their answers would collide.
-    """
-
-    family = reg.FAMILY
-    wild_counts = (8192, 32768)
-
-    def make_servo(self, servo_id: int, config: StsEmulation) -> StsServo:
-        c = config
-        servo = StsServo(servo_id, c.model_number, c.return_delay_us, c.goal_wakes)
-        servo.put(reg.HOMING_OFFSET, c.homing_offset)
-        return servo
-
-    def _ping(self, request: Request, targets: list[StsServo]) -> None:
-        if len(targets) == 1:
-            super()._ping(request, targets)
-
-    def _status(self, servo: StsServo, error: int, data: bytes) -> bytes:
-        """Return the bytes of an answer, with the faults of the settings."""
-        sender = servo.servo_id ^ 0x40 if self.happens(self.config.wrong_id) else servo.servo_id
-        answer = self.family.form.build_status(sender, error, data)
-        return answer[:4] if self.happens(self.config.cut) else answer
-
-
 @dataclass(frozen=True)
-class StsEmulation(BusEmulation):
-    """Settings of emulated STS3215 servos on their bus; see `Emulation` for the others.
+class StsEmulation(ServoEmulation):
+    """Settings of emulated STS3215 servos on their bus; see `ServoEmulation` for the others.
 
     Args:
-        wrong_id: Probability that an answer has the id of another servo.
-        cut: Probability that an answer ends after its fourth byte.
         goal_wakes: Whether writing a goal switches the torque on, the worse case for a driver.
         homing_offset: Offset that every servo subtracts from its encoder's count [counts].
     """
 
-    bus_type = StsBus
-
     model_number: int = 777
-    wrong_id: float = 0.0
-    cut: float = 0.0
     goal_wakes: bool = True
     homing_offset: int = 0
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.require({"wrong_id": (0, 1), "cut": (0, 1), "homing_offset": (-2047, 2047)})
+        self.require({"homing_offset": (-2047, 2047)})
+
+    def servo(self, servo_id: int) -> StsServo:
+        servo = StsServo(servo_id, self.model_number, self.return_delay_us, self.goal_wakes)
+        servo.put(reg.HOMING_OFFSET, self.homing_offset)
+        return servo

@@ -157,8 +157,7 @@ class EmulatedLegs(PlannedRobot[UnitreeEmulation]):
         motors["mode"], motors["tau_est"], motors["temperature"] = self._modes, measured["tau_est"], 35
         motors["q"] = measured["q"] + config.position_noise_rad * draw(size=n)
         motors["dq"] = measured["dq"] + config.velocity_noise_rad_s * draw(size=n)
-        quaternion = _tilted(measured["quaternion"], config.tilt_noise_rad * draw(size=3))
-        imu["quaternion"], imu["rpy"] = quaternion, _roll_pitch_yaw(quaternion)
+        imu["quaternion"] = _tilted(measured["quaternion"], config.tilt_noise_rad * draw(size=3))
         imu["gyroscope"] = measured["gyroscope"] + config.gyro_noise_rad_s * draw(size=3)
         imu["accelerometer"] = measured["accelerometer"] + config.accelerometer_noise_m_s2 * draw(size=3)
         record["foot_force"], record["power_v"], battery = measured["foot_force"], 29.6, record["bms_state"]
@@ -229,13 +228,6 @@ def _tilted(quaternion: np.ndarray, angles_rad: np.ndarray) -> np.ndarray:
     half = 0.5 * angles_rad
     turned = np.concatenate([[w - v @ half], v + w * half + np.cross(v, half)])
     return turned / np.linalg.norm(turned)
-
-
-def _roll_pitch_yaw(q: np.ndarray) -> tuple[float, float, float]:
-    w, x, y, z = (float(c) for c in q)
-    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
-    return float(roll), float(pitch), float(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
 
 
 class VirtualLegs(VirtualTime):

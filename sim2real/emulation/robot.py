@@ -12,11 +12,11 @@ import math
 import tempfile
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from itertools import count
 from pathlib import Path
-from typing import Any, Final, Generic, Protocol, Self, TypeVar
+from typing import Any, Final, Generic, Self, TypeVar
 
 from sim2real.emulation.truth import Truth, TruthLog, read_truth
 from sim2real.errors import UsageError
@@ -81,20 +81,8 @@ class Emulation:
                 raise UsageError(f"emulator: {name} = {getattr(self, name)} is outside [{low}, {high}]")
 
 
-class Physics(Protocol):
-    """What the truth file needs of a plant or a body."""
-
-    def state(self) -> dict[str, float]:
-        """Return the true state, with the same names at every call."""
-        ...
-
-    def truth(self) -> Mapping[str, Any]:
-        """Return the true parameters, which an identification should find."""
-        ...
-
-
-def truth_header(physics: Physics, config: Emulation) -> dict[str, Any]:
-    """Return the header of a truth file."""
+def truth_header(physics: Any, config: Emulation) -> dict[str, Any]:
+    """Return the header of a truth file: settings, and names and parameters of a plant or a body."""
     facts = {"servo_ids": list(getattr(physics, "servo_ids", ())), "state_names": list(physics.state())}
     return {"config": asdict(config), **facts, "truth": physics.truth()}
 
@@ -148,7 +136,7 @@ class VirtualTime(ABC):
 
     port: str
 
-    def __init__(self, physics: Physics, config: Emulation, truth_path: Path | None) -> None:
+    def __init__(self, physics: Any, config: Emulation, truth_path: Path | None) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="sim2real-robot-")
         self.truth_path = Path(self._folder.name) / "truth.bin" if truth_path is None else truth_path
         self.clock: Clock = self

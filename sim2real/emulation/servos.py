@@ -7,9 +7,10 @@ error, and has no watchdog. A family overrides what its firmware does differentl
 from __future__ import annotations
 
 import math
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import ClassVar, Final, Generic, TypeVar
+from dataclasses import dataclass
+from typing import ClassVar, Final
 
 from sim2real.emulation.bus import BusEmulation, PlannedBus, Request, Sample
 from sim2real.emulation.plant import Plant
@@ -32,6 +33,10 @@ class ServoFirmware:
         watchdog_stops: Whether a tripped watchdog stops the motor.
         atomic: Whether a write that is refused in part is refused as a whole, with an error.
         offset_sign: Sign of the homing offset in what is read.
+        wild_counts: Range of positions out of the motor's reach.
+        answers_together: Whether several servos answer a broadcast ping, one after the other.
+        misunderstandings: Errors of a wrong checksum, of an unknown instruction, and of a READ of a wrong length;
+            none: it does not answer these.
     """
 
     family: ClassVar[Family]
@@ -40,6 +45,9 @@ class ServoFirmware:
     offset_sign: ClassVar[int] = 1
     atomic: ClassVar[bool] = False
     watchdog_stops: bool = False
+    wild_counts: ClassVar[tuple[int, int]] = (8192, 32768)
+    answers_together: ClassVar[bool] = False
+    misunderstandings: ClassVar[tuple[int, ...]] = ()
 
     def __init__(self, servo_id: int, model_number: int, return_delay_us: int = 500) -> None:
         self.servo_id, self.heard_ns = servo_id, 0
@@ -183,30 +191,13 @@ class ServoFirmware:
         """React to the torque, which has gone on."""
 
 
-S = TypeVar("S", bound=ServoFirmware)
-E = TypeVar("E", bound=BusEmulation)
+class ServoBus(PlannedBus["ServoEmulation"]):
+    """Emulated servos of one family on a bus, driving a plant; arguments as in `PlannedBus`."""
 
-
-class ServoBus(PlannedBus[E], Generic[S, E]):
-    """Emulated servos of one family on a bus, driving a plant; arguments as in `PlannedBus`.
-
-    Attributes:
-        wild_counts: Range of positions out of the motors' reach.
-    """
-
-    family: ClassVar[Family]
-    wild_counts: ClassVar[tuple[int, int]]
-
-    def __init__(
-        self,
-        plant: Plant,
-        config: E,
-        truth: TruthLog,
-        send: Callable[[bytes], bool],
-    ) -> None:
-        self.form = self.family.form
-        self.servos = {i: self.make_servo(i, config) for i in sorted(plant.servo_ids)}
-        self._handlers: dict[int, Callable[[Request, list[S]], None]] = {
+    def __init__(self, plant: Plant, config: ServoEmulation, truth: TruthLog, send: Callable[[bytes], bool]) -> None:
+        self.servos = {i: config.servo(i) for i in sorted(plant.servo_ids)}
+        self.form = next(iter(self.servos.values())).family.form
+        self._handlers: dict[int, Callable[[Request, list[ServoFirmware]], None]] = {
             Instruction.PING: self._ping,
             Instruction.READ: self._read,
             Instruction.WRITE: self._write,
@@ -216,12 +207,10 @@ class ServoBus(PlannedBus[E], Generic[S, E]):
         }
         super().__init__(plant, config, truth, send, Parser(self.form), self.servos)
 
-    @abstractmethod
-    def make_servo(self, servo_id: int, config: E) -> S:
-        """Return a servo with these settings."""
-
     def execute(self, request: Request) -> None:
         packet = request.packet
+        if packet.code == Instruction.STATUS:
+            return
         # Every servo that receives the instruction resets its watchdog.
         broadcast = packet.servo_id == BROADCAST_ID
         targets = [s for i, s in self.servos.items() if broadcast or i == packet.servo_id]
@@ -232,64 +221,64 @@ class ServoBus(PlannedBus[E], Generic[S, E]):
         if targets and packet.intact and handler is not None:
             handler(request, targets)
         elif targets and not broadcast:
-            self._misunderstand(targets[0], request)
+            self._refuse(targets[0], request, 1 if packet.intact else 0)
 
-    def _misunderstand(self, servo: S, request: Request) -> None:
-        """React to an instruction with a wrong checksum, or an unknown one: here without an answer."""
-
-    def _misread(self, servo: S, request: Request) -> None:
-        """React to a READ of a wrong length: here without an answer."""
-
-    def _ping(self, request: Request, targets: list[S]) -> None:
-        for servo in targets:
+    def _ping(self, request: Request, targets: list[ServoFirmware]) -> None:
+        for servo in targets if len(targets) == 1 or targets[0].answers_together else ():
             self._answer(servo, request, 0, servo.identity)
 
-    def _answer(self, servo: S, request: Request, error: int, data: bytes = b"", sample: Sample | None = None) -> None:
-        """Let a servo answer, with its measurement if the answer has present values."""
-        status = self._status(servo, error | servo.alert, data)
+    def _refuse(self, servo: ServoFirmware, request: Request, kind: int) -> None:
+        """Let a servo answer an instruction that it does not understand, if its protocol has errors for that."""
+        if servo.misunderstandings:
+            self._answer(servo, request, servo.misunderstandings[kind])
+
+    def _answer(
+        self, servo: ServoFirmware, request: Request, error: int, data: bytes = b"", sample: Sample | None = None
+    ) -> None:
+        """Let a servo answer, with its measurement if the answer has present values, and with the line's faults."""
+        sender = servo.servo_id ^ 0x40 if self.happens(self.config.wrong_id) else servo.servo_id
+        status = self.form.build_status(sender, error | servo.alert, data)
+        status = status[:4] if self.happens(self.config.cut) else status
         self.reply(servo.servo_id, request, status, servo.return_delay_s, sample)
 
-    def _status(self, servo: S, error: int, data: bytes) -> bytes:
-        return self.form.build_status(servo.servo_id, error, data)
-
-    def _confirm(self, servo: S, request: Request, error: int) -> None:
+    def _confirm(self, servo: ServoFirmware, request: Request, error: int) -> None:
         """Let a servo answer an instruction that writes."""
         if request.packet.servo_id != BROADCAST_ID and servo.confirms:
             self._answer(servo, request, error)
 
-    def _read_by(self, servo: S, request: Request) -> None:
+    def _read_by(self, servo: ServoFirmware, request: Request) -> None:
         """Let a servo answer a read."""
         address, length = self.form.word(request.packet.parameters, 0), self._second_word(request)
         sample = self.measure(servo, request.t_ns)
         if self.happens(self.config.wild):
-            servo.put(self.family.position, self.random.randrange(*self.wild_counts))
+            servo.put(servo.family.position, self.random.randrange(*servo.wild_counts))
         error, data = servo.read(address, length)
         if servo.answers_reads:
-            present = self.family.position, self.family.velocity, self.family.load
+            present = servo.family.position, servo.family.velocity, servo.family.load
             measured = any(address < r.end and address + length > r.address for r in present)
             self._answer(servo, request, error, data, sample if measured else None)
 
-    def _read(self, request: Request, targets: list[S]) -> None:
+    def _read(self, request: Request, targets: list[ServoFirmware]) -> None:
         if request.packet.servo_id == BROADCAST_ID:
             return
         if len(request.packet.parameters) != 2 * self.form.address_bytes:
-            self._misread(targets[0], request)
-            return
-        self._read_by(targets[0], request)
+            self._refuse(targets[0], request, 2)
+        else:
+            self._read_by(targets[0], request)
 
-    def _sync_read(self, request: Request, targets: list[S]) -> None:
+    def _sync_read(self, request: Request, targets: list[ServoFirmware]) -> None:
         del targets
         for servo_id in request.packet.parameters[2 * self.form.address_bytes :]:
             if servo_id in self.servos:
                 self._read_by(self.servos[servo_id], request)
 
-    def _write(self, request: Request, targets: list[S]) -> None:
+    def _write(self, request: Request, targets: list[ServoFirmware]) -> None:
         parameters = request.packet.parameters
         address, data = self.form.word(parameters, 0), parameters[self.form.address_bytes :]
         for servo in targets:
             self._confirm(servo, request, self._write_to(servo, request, address, data))
 
-    def _sync_write(self, request: Request, targets: list[S]) -> None:
+    def _sync_write(self, request: Request, targets: list[ServoFirmware]) -> None:
         del targets
         parameters, begin = request.packet.parameters, 2 * self.form.address_bytes
         address, length = self.form.word(parameters, 0), self._second_word(request)
@@ -297,14 +286,14 @@ class ServoBus(PlannedBus[E], Generic[S, E]):
             if parameters[i] in self.servos:
                 self._write_to(self.servos[parameters[i]], request, address, parameters[i + 1 : i + 1 + length])
 
-    def _reboot(self, request: Request, targets: list[S]) -> None:
+    def _reboot(self, request: Request, targets: list[ServoFirmware]) -> None:
         for servo in targets:
             self._confirm(servo, request, 0)
             servo.reboot()
             self.configure(servo)
             self.actuate(servo, request)
 
-    def _write_to(self, servo: S, request: Request, address: int, data: bytes) -> int:
+    def _write_to(self, servo: ServoFirmware, request: Request, address: int, data: bytes) -> int:
         """Let a servo change its registers, and the motor follow; return the error."""
         self.measure(servo, request.t_ns)
         error, moves = servo.write(address, data)
@@ -315,3 +304,26 @@ class ServoBus(PlannedBus[E], Generic[S, E]):
 
     def _second_word(self, request: Request) -> int:
         return self.form.word(request.packet.parameters, self.form.address_bytes)
+
+
+@dataclass(frozen=True)
+class ServoEmulation(BusEmulation, ABC):
+    """Settings of emulated servos on their bus; see `Emulation` and `BusEmulation` for the others.
+
+    Args:
+        wrong_id: Probability that an answer has the id of another servo.
+        cut: Probability that an answer ends after its fourth byte.
+    """
+
+    bus_type = ServoBus
+
+    wrong_id: float = 0.0
+    cut: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.require({"wrong_id": (0.0, 1.0), "cut": (0.0, 1.0)})
+
+    @abstractmethod
+    def servo(self, servo_id: int) -> ServoFirmware:
+        """Return a servo with these settings."""

@@ -20,7 +20,7 @@ def draw(seed):
     """Return a family, the faults of its line, and a generator for the rest."""
     rng = random.Random(seed)
     family, faults = rng.choice((VOLTS, STS)), {"seed": seed}
-    for name in ("reply_loss", "corrupt", "late", *(("cut", "wrong_id") if family is STS else ())):
+    for name in ("reply_loss", "corrupt", "late", "cut", "wrong_id"):
         if rng.random() < 0.4:
             faults[name] = rng.choice([0.02, 0.1, 0.3, 0.6])
     if "late" in faults:
@@ -91,7 +91,7 @@ def quiet_and_impatient(monkeypatch):
 def test_random_lines():
     ends, readings = check(range(300))
     # The lines are of all kinds: most readings are made, and buses are lost.
-    assert readings > 2000
+    assert readings > 1500
     assert min(ends["fine"], ends["HardwareLost"]) > 30
     assert len(IDS) == 3
 

@@ -2,9 +2,8 @@
 
 from plants import Joints
 
-from sim2real.emulation.bus import BusEmulation
 from sim2real.emulation.conformance import DeviceConformance
-from sim2real.emulation.servos import ServoBus, ServoFirmware
+from sim2real.emulation.servos import ServoEmulation, ServoFirmware
 from sim2real.hardware import feetech
 from sim2real.hardware.bus.port import BusConfig
 from sim2real.hardware.bus.registers import Family, Register, ServoModel, eeprom, ram
@@ -38,15 +37,9 @@ class AcmeFirmware(ServoFirmware):
     family = FAMILY
 
 
-class AcmeBus(ServoBus[AcmeFirmware, "AcmeEmulation"]):
-    family, wild_counts = FAMILY, (8192, 32767)
-
-    def make_servo(self, servo_id, config):
-        return AcmeFirmware(servo_id, 7, config.return_delay_us)
-
-
-class AcmeEmulation(BusEmulation):
-    bus_type = AcmeBus
+class AcmeEmulation(ServoEmulation):
+    def servo(self, servo_id):
+        return AcmeFirmware(servo_id, 7, self.return_delay_us)
 
 
 class TestAcme(DeviceConformance):
