@@ -88,7 +88,8 @@ def diagnose(policy: Policy, log: Log, drives: Drives | None = None, sim: Log | 
     else:
         try:
             trained = None if sim is None or sim.target is None else solve_plant(drives, sim, contract)[1]["delay_s"]
-            of_plant, figures["plant"] = solve_plant(drives, log, contract, trained)
+            frozen_s = min((f.numbers["from_s"] for f in found if "from_s" in f.numbers), default=np.inf)
+            of_plant, figures["plant"] = solve_plant(drives, log.before(frozen_s), contract, trained)
             findings += of_plant
             if drives.still:
                 skipped[f"the motion of {shortened(drives.still)}"] = "no action moves it, so the replay holds it still"

@@ -83,6 +83,14 @@ class Log:
             return values[low] if not np.any(share > 1e-6) else (1 - share) * values[low] + share * values[high]
         return values[newest(self.state_t, self.t - lag_s)]
 
+    def before(self, end_s: float) -> Log:
+        """Return the part of the log before a time."""
+        steps = {n: v[self.t < end_s] for n in ("t", "command", "obs", "action", "target")
+                 if (v := getattr(self, n)) is not None}  # fmt: skip
+        states = {n: v[self.state_t < end_s] for n in ("state_t", "q", "dq", "quat", "gyro", "lin_vel")
+                  if (v := getattr(self, n)) is not None}  # fmt: skip
+        return replace(self, **steps, **states)
+
 
 def newest(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """Return the row that is newest at each of some times."""

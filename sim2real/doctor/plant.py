@@ -79,8 +79,8 @@ _PARTS = {part.names[0]: part for part in (
     _Part("torque limit", ("limit",), "torque is clipped: {value}", (0.05, 0.08, 0.12, 0.17, 0.24, 0.33, 0.45, 0.6),
           lambda f: f * np.array((0.87, 0.93, 1.07, 1.15)), usual=np.inf, is_off=lambda f: f < 0.75, least=0.12,
           drop=0.17, of="some"),
-    _Part("damping", ("kd",), "{who}: {value:.2f} times the contract's damping", (1.0,),
-          lambda f: f * np.array((0.8, 1.25)), usual=1.0, is_off=lambda f: not 0.4 <= f <= 2.2, of="with the rest"),
+    _Part("damping", ("kd",), "{who}: {value:.2f} times the contract's damping", (1.0, 0.2, 0.4, 2.5),
+          lambda f: f * np.array((0.8, 1.25)), usual=1.0, is_off=lambda f: not 0.5 <= f <= 2.0, of="with the rest"),
 )}  # fmt: skip
 """Name in a setting -> what it is: factors of the contract's gains, shares of the largest torque asked for (friction,
 limit), of the joint's inertia (armature) and of the robot's mass (payload), an angle [rad], and a share of the gains
@@ -338,21 +338,25 @@ class Replay:
         # Soft or limited drives look late and damped at first.
         starts = [plant, *(plant.having({"kd": 1.0, "delay_s": d}) for d in (delay_s, 0.011, 0.6 * delay_s))]
         for name, part in _PARTS.items():
-            if self.drives.torque_driven and name in ("kp", "zero"):
+            if self.drives.torque_driven and name in ("kp", "kd", "zero"):
                 continue
-            for start in starts if name in ("kp", "limit") else starts[:1]:
-                if part.of in ("all", "one too") and name not in plant:
+            for start in starts if name in ("kp", "kd", "zero", "limit") else starts[:1]:
+                if part.of == "with the rest" or (part.of in ("all", "one too") and name not in plant):
                     yield from part.of_joint("").candidates(start, *_NUISANCE)
+                if part.of == "one" or (part.of == "one too" and len(self.scale) > 1 and start is plant):
+                    yield from self._of_one(name, start)
                 if part.of == "some" and not self._of_joints(name, plant):
-                    near = lambda at, name=name: [self._mixed([at, *self._near(at, name)], name)]  # noqa: E731
-                    # Other gains of one joint, which are no fault, look like its limit.
-                    others = [start.having({"kp": p * start.get("kp"), "kd": d * start.get("kd")})
-                              for p, d in ((0.85, 1.0), (1.18, 1.0), (1.0, 0.7), (1.0, 1.4))]  # fmt: skip
-                    tried = [start, *(start.having({f"{name} {j}": v for j in self.drives.joints}) for v in part.grid)]
-                    yield Candidate(part.fault, self._mixed([*tried, *others], name), lambda _: "", (near, *_NUISANCE),
-                                    part.least)  # fmt: skip
-            if part.of == "one" or (part.of == "one too" and len(self.scale) > 1):
-                yield from self._of_one(name, plant)
+                    yield self._of_some(name, start)
+
+    def _of_some(self, name: str, start: Setting) -> Candidate:
+        """Return a part of the joints that move better with it, each with its own value."""
+        part, joints = _PARTS[name], self.drives.joints
+        # Other gains of one joint, which are no fault, look like its limit.
+        others = [start.having({"kp": p * start.get("kp"), "kd": d * start.get("kd")})
+                  for p, d in ((0.85, 1.0), (1.18, 1.0), (1.0, 0.7), (1.0, 1.4))]  # fmt: skip
+        tried = [start, *(start.having({f"{name} {j}": v for j in joints}) for v in part.grid), *others]
+        near = lambda at: [self._mixed([at, *self._near(at, name)], name)]  # noqa: E731
+        return Candidate(part.fault, self._mixed(tried, name), lambda _: "", (near, *_NUISANCE), part.least)
 
     def _of_one(self, name: str, plant: Setting) -> Iterator[Candidate]:
         """Return a part of the joint that moves better if all joints have it."""
@@ -473,23 +477,22 @@ def solve_plant(
 def _with_signs(drives: Drives, log: Log) -> tuple[list[Finding], Replay, Candidate]:
     """Return the replay and its delay, with the joints turned that the log has with the other sign."""
 
-    def started(log: Log) -> tuple[Replay, Candidate]:
-        replay = Replay(drives, log)
+    def started(replay: Replay) -> Candidate:
         best = min(_DELAY.candidates(Setting(), *_NUISANCE), key=lambda c: replay.error(c.setting))
-        return replay, best.descended(replay.error)
+        return best.descended(replay.error)
 
-    findings = list[Finding]()
-    replay, start = started(log)
+    findings, replay = list[Finding](), Replay(drives, log)
+    start = started(replay)
     for i in np.argsort(-replay.errors(start.setting)):
+        before = replay.error(start.setting)
         if replay.errors(start.setting)[i] < 0.5:
             break
         sign = np.where(np.arange(len(drives.joints)) == i, -1.0, 1.0)
-        turned, again = started(replace(replay.log, q=replay.log.q * sign, dq=replay.log.dq * sign))
-        before, after = replay.error(start.setting), turned.error(again.setting)
-        if after < 0.6 * before:
+        turned = Replay(drives, replace(replay.log, q=replay.log.q * sign, dq=replay.log.dq * sign))
+        if (after := turned.error(start.setting)) < 0.6 * before:
             text = f"{drives.joints[i]} is measured with the other sign than in the model"
             findings.append(Finding("sign", "plant", text, (before - after) / before))
-            replay, start = turned, again
+            replay, start = turned, started(turned)
     return findings, replay, start
 
 

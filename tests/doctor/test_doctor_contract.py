@@ -24,15 +24,17 @@ TERMS = (Term("base_ang_vel", scale=0.25), Term("projected_gravity"), Term("join
 CONTRACT = Contract(50.0, JOINTS, tuple(DEFAULT.tolist()), 0.5, TERMS, 20.0, 0.5)
 
 
-def network(rng: np.random.Generator, size: int = CONTRACT.size, metadata: dict[str, str] | None = None) -> bytes:
+def network(
+    rng: np.random.Generator, size: int = CONTRACT.size, metadata: dict[str, str] | None = None, joints: int = 4
+) -> bytes:
     """Return a network of one hidden layer with random weights."""
     arrays = {"k0": rng.normal(size=(size, 32)) * 0.5, "b0": 0.3 * rng.normal(size=32),
-              "k1": rng.normal(size=(32, 4)) * 0.3, "b1": np.zeros(4)}  # fmt: skip
+              "k1": rng.normal(size=(32, joints)) * 0.3, "b1": np.zeros(joints)}  # fmt: skip
     nodes = [helper.make_node("Gemm", ["obs", "k0", "b0"], ["h"]), helper.make_node("Tanh", ["h"], ["x"]),
              helper.make_node("Gemm", ["x", "k1", "b1"], ["actions"])]  # fmt: skip
     shape = lambda name, n: helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, n])  # noqa: E731
     inits = [numpy_helper.from_array(v.astype(np.float32), k) for k, v in arrays.items()]
-    graph = helper.make_graph(nodes, "net", [shape("obs", size)], [shape("actions", 4)], inits)
+    graph = helper.make_graph(nodes, "net", [shape("obs", size)], [shape("actions", joints)], inits)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     for key, value in (metadata or {}).items():
         model.metadata_props.add(key=key, value=value)

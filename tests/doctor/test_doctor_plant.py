@@ -11,8 +11,8 @@ from test_doctor_contract import network
 
 from sim2real import cli
 from sim2real.doctor import before, plant
-from sim2real.doctor.contract import Contract, Term, contract_toml
-from sim2real.doctor.diagnosis import solve_timing
+from sim2real.doctor.contract import Contract, Policy, Term, contract_toml
+from sim2real.doctor.diagnosis import diagnose, solve_timing
 from sim2real.doctor.log import read_deployment
 from sim2real.doctor.plant import Drives, driven_joints, solve_plant
 from sim2real.doctor.search import shortened
@@ -90,6 +90,16 @@ def test_windows_lie_where_the_policy_runs(tmp_path: Path) -> None:
     starts = plant.Replay(Drives(tmp_path / "robot.xml", CONTRACT), late).starts
     assert len(starts) > 5
     assert late.state_t[starts].min() >= late.t[0]
+
+
+def test_the_plant_is_judged_until_a_sensor_freezes(tmp_path: Path) -> None:
+    log = read_deployment(recorded(tmp_path), CONTRACT.joints)
+    q, dq = log.q.copy(), log.dq.copy()
+    q[200:, 1], dq[200:, 1] = q[200, 1], 0.0
+    policy = Policy(network(np.random.default_rng(0), 4, joints=2), CONTRACT)
+    found = diagnose(policy, replace(log, q=q, dq=dq), Drives(tmp_path / "robot.xml", CONTRACT))
+    assert "frozen joint" in found.faults
+    assert not [f for f in found.findings if f.question == "plant"]
 
 
 def test_torque_at_the_limit_of_the_model_is_no_fault(tmp_path: Path) -> None:
