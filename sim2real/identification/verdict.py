@@ -1,14 +1,18 @@
 """The verdict on an identification: judged on held-out data, position by position."""
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
+from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
 
 from sim2real.artifacts.identification import (
     AHEAD,
+    ROUND_TRIP,
     ComparedError,
+    Estimate,
     ExpectedError,
     Judgement,
     with_small_unit,
@@ -114,13 +118,47 @@ def judge(
     return Judgement(status, tuple(dict.fromkeys([*deciding, *reasons, *exceeded, *lacks.reasons])), flags)
 
 
-def state_of(verdict: str, p: Parameter, upper: bool) -> str:
-    """Return the state of a parameter of an accepted fit: ``ok``, ``at a bound`` or ``not determined``.
+def estimates(
+    table: ParameterTable,
+    values: Mapping[str, float],
+    spread: Uncertainty | None = None,
+    truth: Mapping[str, float] = MappingProxyType({}),
+) -> tuple[Estimate, ...]:
+    """Return the rows of the parameters, those to identify first; the last row is the sum of the delays.
+
+    A parameter is ``ok``, ``at a bound``, ``not determined`` or ``fixed``, if the fit is accepted.
 
     Args:
-        verdict: That of ``Uncertainty``.
-        upper: Whether the estimate is in the upper half of its bounds.
+        spread: None: the estimates have no intervals.
+        truth: Known parameters. How the delay is shared between both sides of the world is a convention: only the sum
+            has a true value.
     """
+    rows = []
+    for p in (*table.columns, *(p for p in table if not p.free)):
+        value, numbers, state = values[p.name], dict[str, float](), "not determined" if p.free else "fixed"
+        if not p.free:
+            numbers = {"standard_error": 0.0, "low95": value, "high95": value}
+        elif spread is not None:
+            i = table.names.index(p.name)
+            ends = spread.standard_error[i], spread.low[i], spread.high[i]
+            numbers = dict(zip(("standard_error", "low95", "high95"), map(float, ends), strict=True))
+            x = p.to_scale(value)
+            state = _state_of(spread.verdict[i], p, bool(table.high[i] - x < x - table.low[i]))
+        own = None if p.kind == "delay" and ROUND_TRIP in truth else truth.get(p.name)
+        row = Estimate(p.name, p.unit, p.kind, p.about, p.nominal, value, state, lower=p.low, upper=p.high, truth=own)
+        rows.append(replace(row, **numbers))
+    # The sum of all delays, of which one is identified.
+    delays = [row for row in rows if row.kind == "delay"]
+    free, held = [r for r in delays if r.verdict != "fixed"], [r.estimate for r in delays if r.verdict == "fixed"]
+    if len(free) == 1:
+        ends = {n: getattr(free[0], n) for n in ("estimate", "low95", "high95", "lower", "upper")}
+        ends = {n: None if value is None else value + sum(held) for n, value in ends.items()}
+        about, own = " + ".join(row.name for row in delays), truth.get(ROUND_TRIP)
+        rows.append(replace(free[0], name=ROUND_TRIP, kind="derived", about=about, nominal=0.0, truth=own, **ends))
+    return tuple(rows)
+
+
+def _state_of(verdict: str, p: Parameter, upper: bool) -> str:
     if verdict == BOUND:
         return "ok" if is_physical(p, upper) else verdict
     return "ok" if verdict in (OK, ABSENT) else "not determined"

@@ -7,11 +7,13 @@ import pytest
 
 from sim2real.artifacts.identification import AHEAD, ExpectedError
 from sim2real.identification import verdict
+from sim2real.identification.fit import as_numbers
 from sim2real.identification.held_out import HeldOutPart
 from sim2real.identification.lacks import Lack
 from sim2real.identification.parameters import Parameter, ParameterTable
 from sim2real.identification.predictions import Position, ranked
-from sim2real.identification.uncertainty import Determined
+from sim2real.identification.uncertainty import Determined, Uncertainty
+from sim2real.identification.verdict import estimates
 
 DELAYS = ("sensor_delay", "actuator_delay")
 TABLE = ParameterTable(
@@ -218,3 +220,21 @@ def test_commands_that_are_logged_too_seldom_are_recorded_again_where_no_model_f
 def test_where_nothing_else_helps_further_terms_are_tried():
     assert judge(rows(2.0, 1.0), offers_terms=lambda: True).next == "--terms auto"
     assert judge(rows(2.0, 1.0), lacks=Lack(unexplained=True), offers_terms=lambda: True).next == ""
+
+
+def test_the_rows_have_a_state_and_the_sum_of_the_delays():
+    table = TABLE.with_fixed({"actuator_delay": 0.01})
+    x, count = (table.low + table.high) / 2, len(table)
+    verdicts = ("ok", "not determined", "absent", "ok")
+    made = Uncertainty(np.eye(count), np.ones(count), table.low, table.high, verdicts, 1.0)
+    values = as_numbers(table, x)
+    found = {row.name: row for row in estimates(table, values, made, {"gain": 2.1, "round_trip_delay": 0.05})}
+    assert [found[n].verdict for n in table.names] == ["ok", "not determined", "ok", "ok"]
+    assert (found["actuator_delay"].verdict, found["actuator_delay"].low95) == ("fixed", 0.01)
+    total = found["round_trip_delay"]
+    assert (total.kind, total.estimate, total.truth) == ("derived", pytest.approx(values["sensor_delay"] + 0.01), 0.05)
+    assert (total.low95, total.high95) == (pytest.approx(0.01), pytest.approx(0.07))
+    assert (found["gain"].truth, found["sensor_delay"].truth) == (2.1, None)
+    # Without intervals nothing is determined.
+    bare = {row.name: row for row in estimates(table, values)}
+    assert (bare["gain"].verdict, bare["gain"].low95) == ("not determined", None)

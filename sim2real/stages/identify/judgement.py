@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from sim2real.artifacts.identification import (
-    ROUND_TRIP,
     Estimate,
     Identification,
     Judgement,
@@ -38,7 +37,7 @@ from sim2real.identification.uncertainty import (
 )
 from sim2real.identification.uncertainty import determined as what_is_determined
 from sim2real.identification.uncertainty import widening as posterior_widening
-from sim2real.identification.verdict import ACCEPTED, state_of
+from sim2real.identification.verdict import ACCEPTED
 from sim2real.log.importing.checks import slow_sides
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.identify.fitting import Fits, determined, has_parts, widened, windows_of, without_parts
@@ -141,68 +140,17 @@ def _estimates(pipeline: str, findings: Findings, posterior: Posterior, truth: M
     Args:
         truth: Known parameters of the embedded robot.
     """
-    fit, rows = findings.fit, tuple(_rows(findings, truth))
+    fit = findings.fit
+    # Away from a minimum no interval means anything.
+    spread = findings.spread if fit.converged else None
+    rows = verdict.estimates(fit.problem.table, fit.values, spread, truth)
     document = Identification(pipeline, (), Judgement("", ()), rows)
-    if not fit.converged:  # away from a minimum no interval means anything
-        return replace(document, parameters=tuple(map(_without_interval, rows)))
-    return replace(document, posterior=posterior, widening=findings.widening)
-
-
-def _rows(findings: Findings, truth: Mapping[str, float]) -> list[Estimate]:
-    parameters, spread = findings.fit.problem.table, findings.spread
-    # How the delay is shared between both sides of the world is a convention: only the sum has a true value.
-    own_truth = lambda p: None if p.kind == "delay" and ROUND_TRIP in truth else truth.get(p.name)  # noqa: E731
-    rows = []
-    for i, p in enumerate(parameters.columns):
-        upper = bool(parameters.high[i] - findings.x[i] < findings.x[i] - parameters.low[i])
-        rows.append(
-            Estimate(
-                name=p.name,
-                unit=p.unit,
-                kind=p.kind,
-                about=p.about,
-                nominal=p.nominal,
-                estimate=findings.fit.values[p.name],
-                standard_error=float(spread.standard_error[i]),
-                low95=float(spread.low[i]),
-                high95=float(spread.high[i]),
-                lower=p.low,
-                upper=p.high,
-                verdict=state_of(spread.verdict[i], p, upper),
-                truth=own_truth(p),
-            )
-        )
-    for p in (p for p in parameters if not p.free):
-        numbers = {"standard_error": 0.0, "low95": p.nominal, "high95": p.nominal, "lower": p.low, "upper": p.high}
-        columns_ = (p.name, p.unit, p.kind, p.about, p.nominal, p.nominal)
-        rows.append(Estimate(*columns_, verdict="fixed", truth=own_truth(p), **numbers))
-    return rows + round_trip(rows, truth)
-
-
-def _without_interval(row: Estimate) -> Estimate:
-    """Return the row of a parameter of a fit that did not converge."""
-    if row.verdict == "fixed":
-        return row
-    return replace(row, standard_error=None, low95=None, high95=None, verdict="not determined")
+    return replace(document, posterior=posterior, widening=findings.widening) if fit.converged else document
 
 
 def _doubted(row: Estimate) -> Estimate:
     """Return the row of a parameter of a fit that is not accepted, in which none is ok."""
     return replace(row, verdict="not determined") if row.verdict == "ok" else row
-
-
-def round_trip(rows: Sequence[Estimate], truth: Mapping[str, float]) -> list[Estimate]:
-    """Return the row of the sum of all delays, of which one is identified: at most one row."""
-    delays = [row for row in rows if row.kind == "delay"]
-    free = [row for row in delays if row.verdict != "fixed"]
-    if len(free) != 1:
-        return []
-    held = sum(row.estimate for row in delays if row.verdict == "fixed")
-    moved = {n: getattr(free[0], n) for n in ("estimate", "low95", "high95", "lower", "upper")}
-    moved = {n: None if value is None else value + held for n, value in moved.items()}
-    about = " + ".join(row.name for row in delays)
-    own = truth.get(ROUND_TRIP)
-    return [replace(free[0], name=ROUND_TRIP, kind="derived", about=about, nominal=0.0, truth=own, **moved)]
 
 
 def _predicted(document: Identification, inputs: Inputs, fit: Fit) -> Identification:

@@ -13,12 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
-from sim2real.artifacts.identification import Estimate, Identification, Judgement
+from sim2real.artifacts.identification import Identification, Judgement
 from sim2real.artifacts.paths import shown
 from sim2real.artifacts.progress import write_progress
 from sim2real.artifacts.run import OpenStage
 from sim2real.identification.fit import as_numbers
 from sim2real.identification.parameters import ParameterTable
+from sim2real.identification.verdict import estimates
 from sim2real.stages.identify.inputs import Inputs
 from sim2real.stages.live import live_view
 from sim2real.stages.terminal.console import note
@@ -89,28 +90,13 @@ class Best:
         """Write the best values as an identification with the verdict ``not finished``, without intervals."""
         if self.folder is None or self.inputs is None or self.z is None:
             return
-        values = as_numbers(self.table, self.z)
         done = ", ".join(f"{share:.0%} of {what}" for what, share in self.done.items())
         reason = f"it ended after {done}: these values have no intervals and were not judged on held-out data"
-        rows = [
-            Estimate(
-                name=p.name,
-                unit=p.unit,
-                kind=p.kind,
-                about=p.about,
-                nominal=p.nominal,
-                estimate=values[p.name],
-                lower=p.low,
-                upper=p.high,
-                verdict="not determined" if p.free else "fixed",
-            )
-            for p in self.table
-        ]
         Identification(
             pipeline=self.inputs.loaded.name,
             logs=self.inputs.sources(self.folder.parent),
             verdict=Judgement("not finished", (reason,), self.again),
-            parameters=tuple(rows),
+            parameters=estimates(self.table, as_numbers(self.table, self.z)),
         ).write(self.folder / PARTIAL)
 
 
