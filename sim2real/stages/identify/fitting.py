@@ -93,7 +93,7 @@ def fit_model(inputs: Inputs, best: Best) -> Fits:
     # Refine the model with the selected terms; the parameters of all other terms have their values without the term.
     title = f"identify with {', '.join(base.table.terms) or 'no term'}" if tried else "identify"
     estimate = _fitted(base, best, title, end=base.table.encode(values))
-    return Fits(base, replace(estimate, search=whole.search), parts, tried, added)
+    return Fits(base, estimate, parts, tried, added)
 
 
 def _fitted(inputs: Inputs, best: Best, title: str, end: np.ndarray | None = None) -> Fit:
@@ -147,7 +147,7 @@ def compare_terms(
     """
     table, auto = problem.table, config.terms == "auto"
     x = table.encode({p.name: p.without for p in table} | own.values)
-    whole = replace(own, problem=problem, windows=problem, x=x, search=None)
+    whole = replace(own, problem=problem, windows=problem, x=x)
     parts = parts_of(whole, config, names, _LEAST_TO_CHOOSE if auto else 2)
     search = TermSearch(whole, parts, config.settle_s, config.free_run_s, on_set)
     if search.segments < (count := len(problem.train)):
