@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from sim2real.hardware.joint import Joint
     from sim2real.hardware.safety.gate import GateConfig, GateLimits
     from sim2real.hardware.safety.rig import Rig
-    from sim2real.identification.export.mjcf import Late
+    from sim2real.identification.export.targets import Late
 
 SERVO_ID = 1
 LIMIT_V = 2.0
@@ -174,7 +174,7 @@ class HingeModel(RobotModel):
 
     @property
     def late(self) -> Late:
-        from sim2real.identification.export.mjcf import Late
+        from sim2real.identification.export.targets import Late
 
         return Late(0.5 * STEP_S)
 

@@ -1,19 +1,18 @@
-"""The part of a robot that identification uses: its measured fields, and a graph that predicts them."""
+"""The part of a robot that identification uses: its measured fields, and a graph or a plain simulation of them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar, runtime_checkable
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
 from sim2real.graph.episode import Episode
 from sim2real.graph.node import BaseNode
-from sim2real.identification.export.plain import PlainSimulation as PlainSimulation
 from sim2real.identification.parameters import ParameterTable
 from sim2real.later import jax
-from sim2real.types import Array, PyTree
+from sim2real.types import Array, MjSpec, PyTree
 
 Rows = TypeVar("Rows", np.ndarray, "jax.Array")
 
@@ -118,3 +117,42 @@ class ChecksLogs(Protocol):
     def check(self, episode: Episode) -> None:
         """Raise a ``Sim2RealError`` if a log is of another motion, such as a walk beside a model of legs in a stand."""
         ...
+
+
+@dataclass(frozen=True)
+class PlainSimulation:
+    """A robot for a simulation in plain MuJoCo.
+
+    Attributes:
+        mjcf: The model with the estimates.
+        joints: Joint of each channel.
+        tick_s: Time over which a command acts as its mean [s].
+        begin: Measured positions and velocities ``(2 * channels,)`` -> ``qpos`` and ``qvel``.
+        law: Law of the drives, a function in ``reproduce.py``.
+        numbers: Numbers of that law.
+        integrator: MuJoCo's own, or the function ``verlet`` in ``reproduce.py``.
+        lead_s: Time that is added to the delay of commands, as MuJoCo moves joints half a step early [s].
+        velocity_lead_s: Time over which velocities are extrapolated [s].
+    """
+
+    mjcf: str
+    joints: tuple[str, ...]
+    tick_s: float
+    begin: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+    law: Literal["held", "setpoint", "drive"] = "held"
+    numbers: Mapping[str, np.ndarray] = field(default_factory=dict)
+    integrator: Literal["mj_step", "verlet"] = "mj_step"
+    lead_s: float = 0.0
+    velocity_lead_s: float = 0.0
+
+
+def converged(spec: MjSpec) -> str:
+    """Return a model as MJCF whose solver iterates as often as in an identification on C MuJoCo.
+
+    Args:
+        spec: A ``mujoco.MjSpec``; it is changed.
+    """
+    spec.option.iterations = max(spec.option.iterations, 100)
+    spec.option.ls_iterations = max(spec.option.ls_iterations, 50)
+    spec.compile()
+    return spec.to_xml()

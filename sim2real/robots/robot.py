@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from sim2real.hardware.joint import Joint
     from sim2real.hardware.safety.gate import GateConfig, GateLimits
     from sim2real.hardware.safety.rig import Rig
-    from sim2real.identification.export.mjcf import Late
+    from sim2real.identification.export.targets import Late
     from sim2real.log.importing.mapping import ImportMapping
     from sim2real.stages.config import Defaults
 
@@ -270,7 +270,7 @@ class Simulated:
     @property
     def late(self) -> Late:
         """The timing in C MuJoCo that the text of this MJCF does not hold; default: none."""
-        from sim2real.identification.export.mjcf import Late
+        from sim2real.identification.export.targets import Late
 
         return Late()
 

@@ -14,8 +14,7 @@ from sim2real.artifacts.run import sha256
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
 from sim2real.identification.export.card import differing, json_document, write_card
-from sim2real.identification.export.mjcf import late_mjcf
-from sim2real.identification.export.targets import source_of
+from sim2real.identification.export.targets import late_mjcf, source_of
 from sim2real.identification.export.terms import find_delays, find_terms
 from sim2real.identification.model import IdentifiableModel
 from sim2real.identification.parameters import ParameterTable

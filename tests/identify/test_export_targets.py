@@ -7,8 +7,7 @@ import mujoco
 import pytest
 
 from sim2real.errors import UsageError
-from sim2real.identification.export.mjcf import Late, late_mjcf
-from sim2real.identification.export.targets import TARGETS, source_of
+from sim2real.identification.export.targets import TARGETS, Late, late_mjcf, source_of
 from sim2real.identification.export.terms import Delays, Term, Terms
 
 NAMES = ("arm/pan/joint", "tilt.joint")

@@ -15,7 +15,7 @@ from sim2real.graph.base import Base
 from sim2real.graph.episode import Episode, Steps
 from sim2real.graph.node import BaseNode
 from sim2real.identification.config import FitConfig
-from sim2real.identification.export.mjcf import late_mjcf
+from sim2real.identification.export.targets import late_mjcf
 from sim2real.identification.export.terms import find_terms
 from sim2real.identification.model import Channel
 from sim2real.identification.parameters import Parameter

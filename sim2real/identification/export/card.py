@@ -16,9 +16,8 @@ import numpy as np
 
 from sim2real.artifacts.files import make_folder, write_arrays, write_json
 from sim2real.artifacts.identification import HELD_OUT
-from sim2real.identification.export.plain import PlainSimulation
 from sim2real.identification.export.reproduce import Card
-from sim2real.identification.model import IdentifiableModel
+from sim2real.identification.model import IdentifiableModel, PlainSimulation
 from sim2real.types import Json
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from sim2real import pytree
 from sim2real.errors import UsageError
 from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.node import BaseNode
-from sim2real.identification.export.plain import PlainSimulation, converged
+from sim2real.identification.model import PlainSimulation, converged
 from sim2real.robots.model.file import one_line, read_spec
 from sim2real.robots.model.held import Holding, apply, plan
 from sim2real.types import Array, Json, Key, MjModel, MjSpec, PyTree

@@ -18,7 +18,7 @@ from sim2real.artifacts.files import check
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.episode import Episode
 from sim2real.graph.node import BaseNode
-from sim2real.identification.export.mjcf import Late
+from sim2real.identification.export.targets import Late
 from sim2real.identification.model import Channel, PlainSimulation
 from sim2real.identification.parameters import Parameter, ParameterTable
 from sim2real.log.importing.mapping import toml_value

@@ -19,8 +19,8 @@ import numpy as np
 from sim2real.arrays import beside_damping
 from sim2real.errors import UsageError
 from sim2real.hardware.device import RESPONSE_S, Following
-from sim2real.identification.export.mjcf import Late
-from sim2real.identification.export.plain import PlainSimulation, converged
+from sim2real.identification.export.targets import Late
+from sim2real.identification.model import PlainSimulation, converged
 from sim2real.identification.parameters import Parameter
 from sim2real.later import jnp
 from sim2real.robots.messages import EpisodeStart
