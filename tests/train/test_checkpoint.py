@@ -9,8 +9,8 @@ from environments import Bandit, Constant
 
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.training.config import PPOConfig
+from sim2real.training.ppo.checkpoint import TrainingIdentity, load_checkpoint
 from sim2real.training.ppo.trainer import train
-from sim2real.training.scale.checkpoint import TrainingIdentity, load_checkpoint
 
 CONFIG = PPOConfig(
     num_seeds=2, num_envs=8, minibatches=2, rollout_steps=4, total_steps=256, hidden=(4,), evaluations=4, eval_steps=3,

@@ -42,7 +42,7 @@ for devices in (1, 8):
 found["mesh"] = dict(divided[-1].whole.mesh.shape)
 from sim2real.training.scale.devices import place
 from sim2real.training.ppo.trainer import _train_until_evaluation
-from sim2real.training.ppo.initial_state import make_networks, make_initial_state
+from sim2real.training.ppo.trainer import make_networks, make_initial_state
 
 config = dataclasses.replace(config, num_seeds=1, num_envs=48, rollout_steps=5, hidden=(7,), devices=2)
 networks = make_networks(Bandit(), config)

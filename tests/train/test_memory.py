@@ -13,7 +13,7 @@ from sim2real.policy import ActionTerm, ObservationTerm, PolicyContract, load_bu
 from sim2real.policy.contract import NetworkSpec
 from sim2real.training.config import PPOConfig
 from sim2real.training.networks.architectures import GRU, make_network
-from sim2real.training.networks.sequences import unroll
+from sim2real.training.ppo.losses import unroll
 from sim2real.training.ppo.trainer import train
 
 CONFIG = PPOConfig(

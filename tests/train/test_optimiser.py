@@ -6,7 +6,7 @@ import optax
 import pytest
 
 from sim2real.training.config import PPOConfig
-from sim2real.training.ppo.optimiser import MAX_RATE, MIN_RATE, adapt_rate, get_rate, make_optimiser, set_rate
+from sim2real.training.ppo.update import MAX_RATE, MIN_RATE, adapt_rate, get_rate, make_optimiser, set_rate
 
 
 @pytest.mark.parametrize(

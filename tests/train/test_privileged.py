@@ -10,8 +10,8 @@ from environments import Coin, Constant
 
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.training.config import PPOConfig
-from sim2real.training.networks.normaliser import Normaliser, normalise_parameters, update_normaliser
 from sim2real.training.ppo.trainer import train
+from sim2real.training.ppo.update import Normaliser, normalise_parameters, update_normaliser
 
 CONFIG = PPOConfig(
     num_envs=64, minibatches=4, rollout_steps=16, total_steps=16_000, hidden=(16,), evaluations=1, eval_steps=20,

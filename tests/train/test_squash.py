@@ -12,8 +12,7 @@ from sim2real.policy import ActionTerm, NetworkSpec, ObservationTerm, PolicyCont
 from sim2real.training.config import PPOConfig
 from sim2real.training.networks.architectures import MLP, init_mlp
 from sim2real.training.networks.policy import Policy, log_prob, log_slope
-from sim2real.training.networks.sequences import ActorCritic
-from sim2real.training.ppo.losses import Batch, loss
+from sim2real.training.ppo.losses import ActorCritic, Batch, loss
 
 MEAN, LOG_STD = jnp.array([0.4]), jnp.array([-0.7])
 

@@ -9,8 +9,7 @@ from environments import Bandit
 
 from sim2real.errors import UsageError
 from sim2real.training.config import PPOConfig
-from sim2real.training.ppo.initial_state import swept_numbers
-from sim2real.training.ppo.trainer import train
+from sim2real.training.ppo.trainer import swept_numbers, train
 from sim2real.training.sweep import SWEPT, Sweep, format_point
 
 CONFIG = PPOConfig(

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -186,7 +186,7 @@ class WalkingWorld(ComposedWorld):
         loads: Smallest and largest load in the base [kg].
     """
 
-    floats: Literal[True] = True
+    floats = True
     _table: Mapping[str, tuple[np.ndarray, np.ndarray]] | None = None
 
     def __init__(

@@ -29,8 +29,7 @@ from sim2real.training.config import PPOConfig
 from sim2real.training.environment.tasks import TrainingTask
 from sim2real.training.networks.onnx_export import export_graph
 from sim2real.training.networks.policy import Policy
-from sim2real.training.ppo.result import Progress
-from sim2real.training.ppo.trainer import TrainResult
+from sim2real.training.ppo.trainer import Progress, TrainResult
 from sim2real.training.sweep import Sweep, format_point
 from sim2real.types import Json
 

@@ -39,7 +39,7 @@ from sim2real.stages.train.config import TrainConfig
 from sim2real.stages.train.sensitivity import policy_sensitivity
 from sim2real.stages.train.setup import TrainingSetup, check_identification, prepare, timing_of
 from sim2real.training.ppo import trainer
-from sim2real.training.ppo.result import Progress
+from sim2real.training.ppo.trainer import Progress
 from sim2real.training.scale.processes import join, leads, lost_process_errors, wait_for_all
 from sim2real.training.sweep import Sweep
 from sim2real.types import Json

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,15 +16,6 @@ from sim2real.training.environment.protocol import Step, TrainingEnvironment
 from sim2real.training.environment.pushes import Pushes
 from sim2real.training.environment.tasks import REWARD, Rewards, TrainingTask, checked_end, terms_of, total_of
 from sim2real.types import PyTree
-
-
-@runtime_checkable
-class _EndingWorld(Protocol):
-    """A node that may end an episode: the world of a composed task. Its class would import MuJoCo."""
-
-    def ends(self, state: PyTree) -> tuple[jax.Array, jax.Array]:
-        """Return whether the episode is terminated, and whether it is truncated, bools of shape ``()``."""
-        ...
 
 
 class EnvState(NamedTuple):
@@ -95,7 +86,9 @@ class GraphEnvironment(TrainingEnvironment):
         # jit, so that each is traced only once for all its uses: tracing MuJoCo's worlds takes 5 s.
         self._start, self._play = jax.jit(self._reset), jax.jit(self._step)
         self._rewarding = [name for name, node in graph.nodes.items() if getattr(node, "has_reward", False)]
-        self._ending = {name: node.ends for name, node in graph.nodes.items() if isinstance(node, _EndingWorld)}
+        # The world of a composed task may end an episode: its `ends` returns whether it is terminated, and truncated.
+        ends = {name: getattr(node, "ends", None) for name, node in graph.nodes.items()}
+        self._ending = {name: of_world for name, of_world in ends.items() if of_world is not None}
 
     @property
     def data(self) -> PyTree:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,27 +12,6 @@ from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState
 from sim2real.graph.node import BaseNode
 from sim2real.training.environment.variation import VariationConfig
-from sim2real.types import PyTree
-
-
-@runtime_checkable
-class PushableWorld(Protocol):
-    """A world whose joints can be pushed."""
-
-    def velocity(self, state: PyTree) -> jax.Array:
-        """Return the joints' velocities, shape ``()`` or ``(joints,)`` [rad/s, or m/s]."""
-        ...
-
-    def with_velocity(self, state: PyTree, velocity: jax.Array) -> PyTree:
-        """Return the state with other velocities of the joints."""
-        ...
-
-
-@runtime_checkable
-class FloatingWorld(PushableWorld, Protocol):
-    """A world whose velocities are those of a floating base: linear ``(3,)`` [m/s], then angular ``(3,)`` [rad/s]."""
-
-    floats: Literal[True]
 
 
 @dataclass(frozen=True)
@@ -40,13 +19,16 @@ class Pushes:
     """Pushes of each joint, independent of the others, at the times of policy steps.
 
     Attributes:
+        world: Its ``velocity(state)`` returns the joints' velocities ``()`` or ``(joints,)`` [rad/s, or m/s], and its
+            ``with_velocity(state, velocity)`` the state with others. With ``floats`` they are those of a floating base:
+            linear ``(3,)`` [m/s], then angular ``(3,)`` [rad/s].
         sizes: Largest change of each velocity, or of all with one number [rad/s, or m/s]; changes are uniform within
             it, in both directions. Six: of a floating base, linear ones first.
         chance: Probability that a joint is pushed in a row.
     """
 
     node: str
-    world: PushableWorld
+    world: Any
     sizes: tuple[float, ...]
     chance: float
 
@@ -55,14 +37,14 @@ class Pushes:
         """Return the configured pushes for a policy of ``rate_hz``; None if there are none."""
         if not vary.push:
             return None
-        if not isinstance(world, PushableWorld):
+        if not hasattr(world, "with_velocity"):
             raise UsageError(
                 f"a {type(world).__name__} cannot be pushed: it has no `velocity` and `with_velocity`",
                 hint="give the world velocity(state) and with_velocity(state, velocity), or leave out --vary.push",
             )
         if vary.push_hz > rate_hz:
             raise UsageError(f"vary.push_hz must not exceed the policy's rate, {rate_hz:g} Hz, got {vary.push_hz:g}")
-        floats, angular = isinstance(world, FloatingWorld), vary.push_angular
+        floats, angular = getattr(world, "floats", False), vary.push_angular
         if angular is not None and not floats:
             raise UsageError(
                 f"vary.push_angular: a {type(world).__name__} has no floating base", hint="--vary.push pushes joints"

@@ -29,14 +29,11 @@ After each call the host checks the figures, writes a checkpoint, and reports pr
 
 Files:
 
-- ``trainer.py``: ``train``; the compiled program; the loop on the host
-- ``initial_state.py``: networks, optimiser and copies before the first update
+- ``trainer.py``: ``train``; the state before the first update; the compiled program; the loop on the host
 - ``rollout.py``: ``collect``, ``evaluate``
-- ``update.py``: ``TrainState``, ``prepare``, ``update``
-- ``losses.py``: ``gae``, ``loss``
-- ``optimiser.py``: Adam, its step size
-- ``health.py``: errors for figures that are not finite
-- ``result.py``: ``Progress``, ``TrainResult``
+- ``update.py``: ``TrainState``, ``prepare``, ``update``; the normaliser, Adam
+- ``losses.py``: ``unroll``, ``gae``, ``loss``
+- ``checkpoint.py``: a training after an evaluation, and its file
 """
 
 from __future__ import annotations
@@ -45,7 +42,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from sim2real.training.ppo.result import TrainResult
+    from sim2real.training.ppo.trainer import TrainResult
     from sim2real.training.ppo.trainer import train as train
 
 __all__ = ["train"]

@@ -7,15 +7,16 @@ for the host within a call, and only a few numbers are transferred.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import NamedTuple, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.runtime.compiled.graph import data_of, with_data
@@ -24,16 +25,15 @@ from sim2real.training.environment.protocol import (
     TrainingEnvironment,
     check_environment,
     choose,
+    get_privileged,
     get_width,
     metric_names,
 )
-from sim2real.training.networks.architectures import Factory
+from sim2real.training.networks.architectures import Factory, make_network, name_of
 from sim2real.training.networks.policy import Policy
-from sim2real.training.networks.sequences import ActorCritic
-from sim2real.training.ppo.initial_state import make_initial_state, make_networks, swept_numbers
-from sim2real.training.ppo.result import Progress as Progress
-from sim2real.training.ppo.result import TrainResult as TrainResult
-from sim2real.training.ppo.result import find_best, history_of
+from sim2real.training.ppo.checkpoint import Checkpoint, TrainingIdentity, load_checkpoint, save_checkpoint
+from sim2real.training.ppo.checkpoint import Progress as Progress
+from sim2real.training.ppo.losses import ActorCritic
 from sim2real.training.ppo.rollout import (
     Copies,
     PolicyEvaluation,
@@ -43,14 +43,14 @@ from sim2real.training.ppo.rollout import (
     evaluate,
     new_evaluation,
 )
-from sim2real.training.ppo.update import TrainState, keys, make_policy, update
-from sim2real.training.scale.checkpoint import Checkpoint, TrainingIdentity, load_checkpoint, save_checkpoint
+from sim2real.training.ppo.update import Normaliser, TrainState, keys, make_optimiser, make_policy, set_rate, update
 from sim2real.training.scale.devices import Shardings, gather, place, replicate, shardings_of
 from sim2real.training.scale.processes import agree, leads, require_one_clock
 from sim2real.training.sweep import Sweep as Sweep
 from sim2real.training.sweep import with_numbers
 from sim2real.types import Array, PyTree
 
+T = TypeVar("T")
 GPU_OPTIONS = {"xla_gpu_autotune_level": 0, "xla_gpu_enable_triton_gemm": False}
 """No trials of several kernels for each small matrix product of the networks. The pendulum compiles on
 an H200 in 4.9 s instead of 9.0 s; a step takes 1.4 times as long, 0.7 s of 3 M steps."""
@@ -63,6 +63,39 @@ _Numbers = dict[str, Array]
 """Swept setting -> its value for each member, shape ``(M,)``."""
 _Figures = dict[str, jax.Array]
 _Program = Callable[[TrainState, _Numbers, PyTree], tuple[TrainState, Policy, _Figures]]
+
+
+@dataclass(frozen=True)
+class TrainResult:
+    """The result of a training.
+
+    Attributes:
+        policies: The policies at the end; leaves have a leading seed axis.
+        best: The policy with the highest success rate over all seeds and evaluations; of equals, the highest return.
+        best_seed: Its seed; of a sweep, its place on the seed axis.
+        members: Swept settings of each place on the seed axis, empty without a sweep; all seeds of the first settings
+            come first.
+        history: Name -> shape ``(evaluations, num_seeds)``: the values of ``Progress``; shorter than
+            ``config.evaluations`` if training ended earlier: at the target, or after ``config.minutes``.
+        env_steps: Shape ``(evaluations,)``: number of rows per seed at each evaluation.
+        elapsed_s: Shape ``(evaluations,)``: time that training took so far [s].
+        observations: Shape ``(N, O)``: the copies' last observations, of the best policy's place on the seed axis.
+        env_steps_per_s: Rows of all seeds per second of ``train_s``, without those of evaluations.
+        compile_s: Time to trace and compile [s].
+        train_s: Time to train and evaluate [s]; of a resumed training, since it was resumed.
+    """
+
+    policies: Policy
+    best: Policy
+    best_seed: int
+    members: list[dict[str, float]]
+    history: dict[str, np.ndarray]
+    env_steps: np.ndarray
+    elapsed_s: np.ndarray
+    observations: np.ndarray
+    env_steps_per_s: float
+    compile_s: float
+    train_s: float
 
 
 def train(
@@ -356,3 +389,129 @@ def small_random_numbers() -> Iterator[None]:
 def compile_lowered(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
     """Return the compiled program."""
     return lowered.compile(compiler_options=dict(GPU_OPTIONS) if jax.default_backend() == "gpu" else None)
+
+
+def history_of(log: list[Progress]) -> dict[str, np.ndarray]:
+    """Return name -> values, shape ``(evaluations, num_seeds)``."""
+    return {name: np.stack([progress.values[name] for progress in log]) for name in log[0].values}
+
+
+def find_best(history: dict[str, np.ndarray]) -> tuple[int, int]:
+    """Return the index of the best evaluation and seed: by success, then by return, then the latest."""
+    returns = history["return"]
+    success = history.get("success", np.zeros_like(returns))
+    evaluations, seeds = returns.shape
+    cells = [(evaluation, seed) for evaluation in range(evaluations) for seed in range(seeds)]
+    return max(cells, key=lambda cell: (success[cell], returns[cell], cell[0]))
+
+
+# -- the state before the first update
+
+
+def make_initial_state(
+    env: TrainingEnvironment, configs: Sequence[PPOConfig], key: jax.Array, networks: ActorCritic
+) -> TrainState:
+    """Return the states before the first update, with a leading axis; compiles nothing.
+
+    Args:
+        configs: Settings that differ only in numbers. The leading axis has all seeds of the first, then those of the
+            next.
+        key: Seed i depends on it and on i alone.
+    """
+    first = configs[0]
+    keys = jnp.stack([jax.random.fold_in(key, seed) for seed in range(first.num_seeds)])
+    key_data = np.asarray(jax.random.key_data(keys))
+
+    # Networks, optimiser and normalisers of each place on the leading axis.
+    sizes = env.observation_size, np.shape(env.action_low)[0], privileged_size(env, first)
+    rngs = ((config, np.random.default_rng(data)) for config in configs for data in key_data)
+    learners = [_new_learner(config, networks, rng, sizes) for config, rng in rngs]
+    params, optimiser, normaliser, privileged = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *learners)
+
+    # The environments' states are zeros; the first rollout resets them.
+    shapes = jax.eval_shape(env.reset, jax.eval_shape(lambda: jax.random.key(0)))
+    members = len(learners)
+    count = members, first.num_envs
+    carries = (net.initial_carry() for net in (networks.actor, networks.critic))
+    copies = Copies(*_blank(shapes, count), *(_repeated(carry, count) for carry in carries))
+    keys = keys if len(configs) == 1 else jnp.tile(keys, len(configs))
+    # The share of a curriculum that follows success.
+    follows = env.curriculum is not None and env.follow > 0.0
+    reached = jnp.full(members, env.curriculum[0], jnp.float32) if env.curriculum is not None and follows else None
+    return TrainState(params, optimiser, normaliser, privileged, copies, jnp.zeros(members, jnp.int32), keys, reached)
+
+
+def swept_numbers(sweep: Sweep, num_seeds: int) -> dict[str, Array]:
+    """Return setting -> its value for each place on the seed axis, float32."""
+    return {n: np.repeat(np.array([point[n] for point in sweep.grid], np.float32), num_seeds) for n in sweep.values}
+
+
+def make_networks(
+    env: TrainingEnvironment, config: PPOConfig, actor: Factory | None = None, critic: Factory | None = None
+) -> ActorCritic:
+    """Return the networks of a training.
+
+    Args:
+        actor: Default: ``config.network``.
+        critic: Default: ``config.critic``, or the actor's network.
+
+    Raises:
+        UsageError: There is no such network, or it does not fit.
+    """
+    kind = actor or config.network
+    critic_kind = critic or config.critic or kind
+    size, actions = env.observation_size, np.shape(env.action_low)[0]
+    critic_size = size + (privileged_size(env, config) or 0)
+    return ActorCritic(
+        actor=make_network(kind, config.hidden, size, actions),
+        critic=make_network(critic_kind, config.hidden, critic_size, 1, exported=False),
+        name=name_of(kind),
+    )
+
+
+def privileged_size(env: TrainingEnvironment, config: PPOConfig) -> int | None:
+    """Return the number of the value function's further inputs; None if ``config`` has none."""
+    privileged = get_privileged(env, config)
+    if privileged is None:
+        return None
+    state = jax.eval_shape(env.reset, jax.eval_shape(lambda: jax.random.key(0)))[0]
+    shape = jax.eval_shape(privileged, state).shape
+    if len(shape) != 1:
+        raise UsageError(f"the environment's `privileged` must return a vector, it has shape {shape}")
+    return shape[0]
+
+
+def _repeated(carry: T, count: tuple[int, ...]) -> T:
+    """Return a copy of a carry for each copy of the environment."""
+    return jax.tree.map(lambda leaf: np.broadcast_to(leaf, (*count, *np.shape(leaf))), carry)
+
+
+def _new_learner(
+    config: PPOConfig, networks: ActorCritic, rng: np.random.Generator, sizes: tuple[int, int, int | None]
+) -> tuple[dict[str, PyTree], optax.OptState, Normaliser, Normaliser | None]:
+    """Return networks, optimiser and normalisers; ``sizes``: of observation, action and privileged observation."""
+    size, actions, privileged = sizes
+    params = {
+        "actor": networks.actor.init(rng, size, 0.01),
+        "log_std": np.full(actions, config.log_std_init, np.float32),
+        "value": networks.critic.init(rng, size + (privileged or 0), 1.0),
+    }
+    optimiser = _blank(jax.eval_shape(make_optimiser(config).init, params), ())
+    if config.schedule == "adaptive":
+        optimiser = set_rate(optimiser, np.float32(config.learning_rate))
+    return params, optimiser, _new_normaliser(size), None if privileged is None else _new_normaliser(privileged)
+
+
+def _new_normaliser(size: int) -> Normaliser:
+    """Return the statistics before the first observation, in numpy."""
+    return Normaliser(np.asarray(np.float32(0)), np.zeros(size, np.float32), np.ones(size, np.float32))
+
+
+def _blank(shapes: T, leading: tuple[int, ...]) -> T:
+    """Return zeros of given shapes and dtypes, with leading axes; in numpy, as jnp.zeros compiles for each shape."""
+
+    def leaf(struct: jax.ShapeDtypeStruct) -> jax.Array | np.ndarray:
+        is_key = jnp.issubdtype(struct.dtype, jax.dtypes.prng_key)
+        return (jnp if is_key else np).zeros((*leading, *struct.shape), struct.dtype)
+
+    return jax.tree.map(leaf, shapes)

@@ -1,4 +1,4 @@
-"""One PPO update: the batch of a rollout with its advantages, then minibatch steps."""
+"""One PPO update: the batch of a rollout with its advantages, minibatch steps of Adam, and the normaliser."""
 
 from collections.abc import Callable
 from functools import partial
@@ -6,19 +6,118 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 
 from sim2real.policy.contract import NetworkSpec
+from sim2real.policy.runner import OBSERVATION_CLIP
 from sim2real.training.config import PPOConfig
 from sim2real.training.environment.protocol import TrainingEnvironment, widen
-from sim2real.training.networks.normaliser import Normaliser, deviations, normalise_parameters, update_normaliser
 from sim2real.training.networks.policy import Policy, log_prob
-from sim2real.training.networks.sequences import ActorCritic, unroll
-from sim2real.training.ppo.losses import Batch, gae, loss
-from sim2real.training.ppo.optimiser import adapt_rate, get_rate, make_optimiser, set_rate
+from sim2real.training.ppo.losses import ActorCritic, Batch, gae, loss, unroll
 from sim2real.training.ppo.rollout import Copies, Rows
 from sim2real.training.scale.devices import divide_minibatches
-from sim2real.types import PyTree
+from sim2real.types import Array, PyTree
+
+_MIN_VARIANCE = 1e-6
+"""Smallest variance of an observation, in its unit squared."""
+ADAM_EPS = 1e-5
+MIN_RATE, MAX_RATE, RATE_FACTOR = 1e-5, 1e-2, 1.5
+"""Bounds of an adaptive step size, and the factor of a change: those of rsl_rl."""
+
+
+# -- running statistics of the networks' inputs
+
+
+class Normaliser(NamedTuple):
+    """Running mean and variance of the observations, or of the value function's further inputs.
+
+    Attributes:
+        seen: Shape ``()``: number of observations so far.
+        mean: Shape ``(O,)``.
+        var: Shape ``(O,)``.
+    """
+
+    seen: Array
+    mean: Array
+    var: Array
+
+
+def update_normaliser(normaliser: Normaliser, observations: jax.Array, valid: jax.Array) -> Normaliser:
+    """Return the statistics with more observations added (parallel variance, Chan et al. 1979).
+
+    Args:
+        observations: Shape ``(T, N, O)``.
+        valid: Shape ``(T, N)``, bool: the observations that count.
+    """
+    # Mean and variance of the new observations.
+    weight = valid.astype(jnp.float32)[..., None]
+    count = jnp.maximum(weight.sum(), 1.0)
+    mean = (weight * observations).sum((0, 1), keepdims=True) / count
+    var = (weight * (observations - mean) ** 2).sum((0, 1)) / count
+
+    # Those of all observations.
+    total = normaliser.seen + count
+    delta = mean[0, 0] - normaliser.mean
+    squares = normaliser.var * normaliser.seen + var * count + delta**2 * normaliser.seen * count / total
+    return Normaliser(total, normaliser.mean + delta * count / total, squares / total)
+
+
+def deviations(normaliser: Normaliser) -> jax.Array:
+    """Return the standard deviations that a policy divides by, shape ``(O,)``."""
+    return jnp.sqrt(normaliser.var + _MIN_VARIANCE)
+
+
+def normalise_parameters(normaliser: Normaliser, values: jax.Array) -> jax.Array:
+    """Return physical parameters ``(O,)`` in deviations from their mean.
+
+    They have any order of magnitude, and some are equal in all episodes. So the smallest deviation is a thousandth of
+    the mean, not a constant.
+    """
+    std = jnp.sqrt(normaliser.var + (1e-3 * normaliser.mean) ** 2 + 1e-20)
+    return jnp.clip((values - normaliser.mean) / std, -OBSERVATION_CLIP, OBSERVATION_CLIP)
+
+
+# -- Adam, and the schedule of its step size
+
+
+def make_optimiser(config: PPOConfig) -> optax.GradientTransformation:
+    """Return Adam with gradient clipping; a linear step size falls to 5 %, an adaptive one is part of the state.
+
+    It acts on one flat vector, which compiles and runs faster than a dozen small arrays.
+    """
+    if config.schedule == "adaptive":
+        adam = optax.inject_hyperparams(optax.adam, static_args=("eps",))(config.learning_rate, eps=ADAM_EPS)
+    else:
+        steps = config.updates * config.epochs * config.minibatches
+        rate = optax.linear_schedule(config.learning_rate, 0.05 * config.learning_rate, steps)
+        adam = optax.adam(rate, eps=ADAM_EPS)
+    return optax.flatten(optax.chain(optax.clip_by_global_norm(config.max_grad_norm), adam))
+
+
+def get_rate(state: optax.OptState) -> jax.Array:
+    """Return the adaptive step size in an optimiser's state."""
+    return optax.tree_utils.tree_get(state, "learning_rate")
+
+
+def set_rate(state: optax.OptState, rate: jax.Array | np.floating) -> optax.OptState:
+    """Return an optimiser's state with another adaptive step size."""
+    return optax.tree_utils.tree_set(state, learning_rate=rate)
+
+
+def adapt_rate(rate: jax.Array, kl: jax.Array, target_kl: float) -> jax.Array:
+    """Return the next step size: smaller if the policy moved too far, larger if it hardly moved.
+
+    Args:
+        rate: Shape ``()``.
+        kl: Shape ``()``: KL divergence from the policy that played [nat]; 0, as before the first step, keeps the rate.
+        target_kl: Wanted KL divergence [nat].
+    """
+    smaller, larger = jnp.maximum(rate / RATE_FACTOR, MIN_RATE), jnp.minimum(rate * RATE_FACTOR, MAX_RATE)
+    return jnp.where(kl > 2 * target_kl, smaller, jnp.where((kl > 0) & (kl < target_kl / 2), larger, rate))
+
+
+# -- the update
 
 
 class TrainState(NamedTuple):

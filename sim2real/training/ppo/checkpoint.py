@@ -1,4 +1,4 @@
-"""A whole training in one safetensors file, to continue from.
+"""A training after an evaluation, and its safetensors file, to continue from.
 
 The file is replaced as a whole: a process that is interrupted while it writes leaves the earlier file. Orbax takes
 0.5 s to import, and 45 ms for a save that takes 6 ms here.
@@ -23,7 +23,6 @@ from safetensors.numpy import save_file
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.training.config import PPOConfig
 from sim2real.training.networks.policy import Policy
-from sim2real.training.ppo.result import Progress
 from sim2real.training.ppo.update import TrainState
 from sim2real.training.sweep import Sweep
 from sim2real.types import Array, Json, PyTree
@@ -31,6 +30,26 @@ from sim2real.types import Array, Json, PyTree
 _METADATA = "training"
 _MAY_DIFFER = ("target", "minutes")
 """Settings that change when training ends, but not its numbers."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Progress:
+    """Progress of the training at an evaluation.
+
+    Attributes:
+        evaluation: Number of this evaluation, from 1.
+        env_steps: Number of rows so far, per seed.
+        elapsed_s: Time that training took so far, compilation included [s].
+        values: Name -> shape ``(num_seeds,)``: ``return``, the environment's metrics, losses.
+        best: The best policy so far, see ``TrainResult``; None in checkpoints, which hold it once.
+    """
+
+    evaluation: int
+    evaluations: int
+    env_steps: int
+    elapsed_s: float
+    values: dict[str, np.ndarray]
+    best: Policy | None = None
 
 
 class Checkpoint(NamedTuple):
