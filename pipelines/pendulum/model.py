@@ -12,7 +12,7 @@ from sim2real.arrays import namespace
 from sim2real.graph.base import Array, Base, GraphState, StepState
 from sim2real.identification.parameters import Parameter
 from sim2real.later import jnp
-from sim2real.robots.agent import DirectAgent
+from sim2real.robots.agent import PolicyAgent
 from sim2real.worlds.joint import Forces, JointState, JointWorld
 
 GRAVITY = 9.81  # [m/s^2]
@@ -180,11 +180,20 @@ class PendulumWorld(JointWorld):
         return state.replace(thdot=velocity)
 
 
-class Agent(DirectAgent):
-    """The policy's node: cos, sin, thdot / 10 and a short history in, ``(19,)``; a voltage out."""
+class Agent(PolicyAgent):
+    """The policy's node: cos, sin, thdot / 10 and a short history of these and of voltages in; a voltage out."""
 
     def __init__(self, name: str, rate: float, **options: Any) -> None:
-        super().__init__(name, rate, features, (3, 1), HISTORY, Command, **options)
+        super().__init__(name, rate, 1, HISTORY, (3, 1), **options)
+
+    def features(self, reading: Measurement, step_state: StepState) -> Array:
+        return features(reading)
+
+    def row(self, reading: Measurement, features: Array, command: Array, action: Array) -> Array:
+        return namespace(features, action).concatenate([features, action])
+
+    def message(self, command: Array, step_state: StepState) -> Command:
+        return Command(command)
 
 
 def features(m: Measurement) -> Array:

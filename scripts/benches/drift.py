@@ -75,7 +75,7 @@ def play(path: Path, arm: arms.HiddenArm, robot: Any, policy: Policy, seconds: f
 def steps(robot: Any) -> Policy:
     """Return the small steps before a deployment: away from rest and back."""
     rest, each = np.asarray(robot.drive.servos.at_rest, float), round(STEP_S * RATE_HZ)
-    away = rest + STEP_RAD * (np.arange(len(rest)) == robot.drive.probe.joint)
+    away = rest + STEP_RAD * (np.arange(len(rest)) == 0)
     return lambda k, _: away if k // each % 2 else rest
 
 

@@ -191,35 +191,3 @@ class GoalAgent(PolicyAgent):
         """Return the aim at a step; its time is that of the policy's schedule, on the robot as in simulation."""
         aim = step_state.params.aim
         return aim if self._at is None else self._at(aim, step_state.seq / self.rate)
-
-
-class DirectAgent(PolicyAgent):
-    """Sends a policy's actions unchanged, e.g. voltages; the history has features, then actions.
-
-    Args:
-        features: Features of a measurement: message of the sensor -> ``(features,)``.
-        sizes: Numbers of features and of actions.
-        message: Makes the node's message of an action.
-    """
-
-    def __init__(
-        self,
-        name: str,
-        rate: float,
-        features: Callable[[PyTree], Array],
-        sizes: tuple[int, int],
-        history: int,
-        message: Callable[[PyTree], PyTree],
-        **options: Unpack[NodeOptions],
-    ) -> None:
-        super().__init__(name, rate, sizes[1], history, sizes, **options)
-        self._features, self._message = features, message
-
-    def features(self, reading: PyTree, step_state: StepState) -> Array:
-        return self._features(reading)
-
-    def row(self, reading: PyTree, features: Array, command: Array, action: Array) -> Array:
-        return namespace(features, action).concatenate([features, action])
-
-    def message(self, command: Array, step_state: StepState) -> PyTree:
-        return self._message(command)

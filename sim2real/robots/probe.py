@@ -29,6 +29,8 @@ _TURNS = 10
 _AGAIN = 5
 """Samples after which a command is sent again: it must not become stale."""
 _STILL_RAD_S, _STILL_S, _REST_S = 0.05, 0.1, 3.0
+_JOINT, _STEPS = 0, 8
+"""The joint that is stepped, and the number of steps."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ class StepAnswers:
 
 @dataclass(frozen=True)
 class Probe:
-    """Small steps by which a robot's delay is measured.
+    """Small steps of the first joint, by which a robot's delay is measured.
 
     Attributes:
         step: Size of a step [the command's unit].
@@ -73,8 +75,6 @@ class Probe:
 
     step: float
     lag_s: tuple[float, float] = (0.0, 0.0)
-    joint: int = 0
-    steps: int = 8
 
 
 @dataclass
@@ -165,16 +165,16 @@ def delays_of(answers: Sequence[np.ndarray]) -> StepAnswers:
 def _answers(witness: Witness, probe: Probe) -> list[np.ndarray]:
     """Return the answers to some steps; those during which this machine was busy are made again."""
     answers: list[np.ndarray] = []
-    for before, goal in itertools.islice(itertools.cycle(_steps(witness.rig, probe)), _TRIES * probe.steps):
-        answer = _answer(witness, probe.joint, before, goal)
+    for before, goal in itertools.islice(itertools.cycle(_steps(witness.rig, probe)), _TRIES * _STEPS):
+        answer = _answer(witness, before, goal)
         answers += [] if answer is None else [answer]
-        if len(answers) == probe.steps:
+        if len(answers) == _STEPS:
             return answers
     if len(answers) >= _FEWEST:
         return answers
     raise SafetyStop(
         f"the delay cannot be measured: this machine was busy during all but {len(answers)} of "
-        f"{_TRIES * probe.steps} small steps",
+        f"{_TRIES * _STEPS} small steps",
         hint="close what else runs on it; without this check: --no-measure-delay",
     )
 
@@ -182,31 +182,31 @@ def _answers(witness: Witness, probe: Probe) -> list[np.ndarray]:
 def _steps(rig: Rig, probe: Probe) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return the command before each step, and that of the step: from rest and back, or to both sides of zero."""
     rest, away = rig.gate.fallback, rig.gate.fallback
-    away[probe.joint] += probe.step
+    away[_JOINT] += probe.step
     if rig.gate.config.stale == "zero":
         return [(rest, away), (rest, -away)]
     if np.any(away > rig.gate.config.range[1]):
-        away[probe.joint] -= 2 * probe.step
+        away[_JOINT] -= 2 * probe.step
     return [(rest, away), (away, rest)]
 
 
-def _answer(witness: Witness, joint: int, before: np.ndarray, goal: np.ndarray) -> np.ndarray | None:
+def _answer(witness: Witness, before: np.ndarray, goal: np.ndarray) -> np.ndarray | None:
     """Return the answer to a step: times since the command [s], and motion in its direction [rad]; None: too few."""
     _settle(witness, before)
-    clock, begin, rows = witness.clock, witness.measure().position_rad[joint], []
+    clock, begin, rows = witness.clock, witness.measure().position_rad[_JOINT], []
     left_ns = clock.now_ns()
     witness.command(goal)
     sent_s = 1e-9 * (clock.now_ns() - left_ns)
     while (now_ns := clock.now_ns()) < left_ns + round(1e9 * _WATCHED_S):
         reading = witness.measure()
-        rows.append((1e-9 * (reading.transaction.t_sent_ns - left_ns), reading.position_rad[joint] - begin))
+        rows.append((1e-9 * (reading.transaction.t_sent_ns - left_ns), reading.position_rad[_JOINT] - begin))
         if len(rows) % _AGAIN == 0:
             witness.command(goal)
         clock.sleep(max(0.0, _PERIOD_S - 1e-9 * (clock.now_ns() - now_ns)))
     if witness.rig.gate.config.stale == "zero":
         witness.command(before)
     longest_s = max(sent_s, *np.diff([0.0, *(t_s for t_s, _ in rows)]))
-    return np.array(rows) * [1.0, np.sign(goal[joint] - before[joint])] if longest_s < _BUSY_S else None
+    return np.array(rows) * [1.0, np.sign(goal[_JOINT] - before[_JOINT])] if longest_s < _BUSY_S else None
 
 
 def _settle(witness: Witness, command: np.ndarray) -> None:

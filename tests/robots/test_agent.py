@@ -3,14 +3,14 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from oracles.conformance import NodeConformance
 
 from sim2real import pytree
 from sim2real.graph import BaseNode
 from sim2real.graph.base import GraphState, InputState, StepState
-from sim2real.robots.agent import AgentParams, DirectAgent, GoalAgent
-from sim2real.robots.messages import Goals, JointReading
+from sim2real.robots.agent import AgentParams, GoalAgent
+from sim2real.robots.messages import JointReading
+from sim2real.stages.load import load_module
 
 LOW, HIGH, RATE_HZ = np.array([-1.0, -0.5]), np.array([0.8, 1.2]), 50.0
 AIM, START = np.array([0.25, -0.5, 2.0]), np.array([0.1, -0.2])
@@ -113,22 +113,22 @@ def test_it_asks_the_policy_and_without_one_goals_stay():
     np.testing.assert_allclose(decision.goal, START, atol=1e-7)
 
 
-def test_a_direct_agent_sends_actions_as_they_are_and_shows_what_it_saw_and_did_before():
-    agent = DirectAgent("agent", RATE_HZ, lambda m: m.position * 10.0, (2, 1), 2, Goals)
-    policy = Push(jnp.array([0.5]))
-    state, sent = agent.init_state(), []
+def test_the_pendulums_agent_sends_actions_as_they_are_and_shows_what_it_saw_and_did_before():
+    model = load_module("pendulum", "model")
+    agent, policy = model.Agent("agent", RATE_HZ), Push(None)
+    state, sent, one = agent.init_state(), [], jnp.zeros(1)
     for k in range(3):
-        one = jnp.zeros(1)
-        reading = JointReading(jnp.array([[k, -k]], jnp.float32), jnp.zeros((1, 2)))
+        reading = model.Measurement(th=jnp.zeros(1), thdot=jnp.array([10.0 * k]))
         heard = {"sensor": InputState(one.astype(int), one, one, reading)}
         policy.action = jnp.array([0.5 + k])
         made = agent.step(StepState(state=state, params=AgentParams(policy=policy), inputs=heard))
         state = made[0].state
-        sent.append(float(made[1].goal[0]))
+        sent.append(float(made[1].action[0]))
     assert sent == [0.5, 1.5, 2.5]
-    np.testing.assert_array_equal(policy.shown[0], np.zeros(8))
-    np.testing.assert_array_equal(policy.shown[2], [20, -20, 10, -10, 0, 0, 1.5, 0.5])
-    np.testing.assert_array_equal(agent.init_output().goal, [0.0])
+    rows = np.zeros((3, model.HISTORY, 4))
+    rows[1, 0], rows[2, :2] = [1, 0, 0, 0.5], [[1, 0, 1, 1.5], [1, 0, 0, 0.5]]
+    for k, row in enumerate(rows):
+        np.testing.assert_array_equal(policy.shown[k], [1, 0, k, *row[:, :3].ravel(), *row[:, 3]])
 
 
 @pytree.dataclass
@@ -144,16 +144,15 @@ class Counting:
         return carry + 1.0, jnp.full(2, self.first + carry)
 
 
-@pytest.mark.parametrize("kind", ["goal", "direct"])
-def test_a_policy_that_remembers_goes_on_and_begins_anew_with_each_episode(kind):
-    agent = make_agent() if kind == "goal" else DirectAgent("agent", RATE_HZ, lambda m: m.position, (2, 2), 2, Goals)
+def test_a_policy_that_remembers_goes_on_and_begins_anew_with_each_episode():
+    agent = make_agent()
     for _ in range(2):
         step_state, _ = started(agent, policy=Counting(0.1))
         sent = []
         for _ in range(3):
             step_state, message = agent.step(seeing(step_state, [0.0, 0.0], [0.0, 0.0]))
             sent.append(np.asarray(jax.tree.leaves(message)[0]))
-        moved = np.diff([START, *sent], axis=0) * RATE_HZ if kind == "goal" else sent
+        moved = np.diff([START, *sent], axis=0) * RATE_HZ
         np.testing.assert_allclose(moved, np.array([[0.1], [1.1], [2.1]]) * np.ones(2), rtol=1e-4)
 
 

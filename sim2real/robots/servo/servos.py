@@ -155,10 +155,10 @@ class JointSensor(RobotSensor):
 
     units = MappingProxyType({"position": "rad", "velocity": "rad/s"})
 
-    def __init__(self, servos: Servos, position_sigma_rad: float = 0.002, velocity_sigma_rad_s: float = 0.05) -> None:
-        sigmas, names = (position_sigma_rad, velocity_sigma_rad_s), servos.names
+    def __init__(self, servos: Servos) -> None:
+        names = servos.names
         self.channels = tuple(
-            Channel("position", "velocity", *sigmas, index=i, label=name, goal="goal") for i, name in enumerate(names)
+            Channel("position", "velocity", 0.002, 0.05, i, name, goal="goal") for i, name in enumerate(names)
         )
         self.at_rest = JointReading(servos.at_rest, np.zeros(len(names)))
 

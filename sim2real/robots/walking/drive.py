@@ -201,10 +201,9 @@ class WalkingDrive(RobotDrive):
         rate_hz: float,
         gains: tuple[float, float],
         motors: LegMotors | None = None,
-        stand_up: StandUp | None = None,
     ) -> None:
         self._mjcf, self._joints, self.centre, self.rate_hz = mjcf, tuple(joints), np.asarray(stance), rate_hz
-        self._motors, self._stand_up = motors, stand_up or StandUp()
+        self._motors = motors
         self.crouch = _BENT * (np.asarray(motors.folded) - self.centre) if motors else np.zeros_like(self.centre)
         self.message: Callable[[Any], LegCommand] = partial(leg_command, kp=gains[0], kd=gains[1])
 
@@ -233,7 +232,7 @@ class WalkingDrive(RobotDrive):
         Raises:
             SafetyStop: It tips over, or stands in another pose than its stance at the end.
         """
-        motion = self._stand_up
+        motion = StandUp()
         if rig.torque_withheld:
             return
         reading, now_ns = rig.measure(), rig.clock.now_ns

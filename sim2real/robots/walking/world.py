@@ -170,6 +170,10 @@ class Ground(composer.Task):
 
 mj: Any = mujoco
 
+LOADS_KG = (-1.0, 3.0)
+"""Smallest and largest load in the base [kg]."""
+_CONTACTS, _ROWS_OF_CONSTRAINTS = 16, 96
+"""Room on Warp for contacts, and for rows of constraints, in a copy."""
 _ROWS = 9
 """Loads that the table of models has; between them the constants are interpolated."""
 _LOADED = ("body_mass", "body_ipos", "body_inertia", "body_subtreemass", "body_invweight0", "dof_invweight0")
@@ -181,21 +185,16 @@ class WalkingWorld(ComposedWorld):
 
     A load in the base changes masses, and constants that MuJoCo derives from them. A program that computes them takes
     7 s longer to compile. So the host computes them for a few loads, and the program interpolates.
-
-    Args:
-        loads: Smallest and largest load in the base [kg].
     """
 
     floats = True
     _table: Mapping[str, tuple[np.ndarray, np.ndarray]] | None = None
 
-    def __init__(
-        self, task: Ground, parameters: Mapping[str, tuple[Any, str]], loads: tuple[float, float], **options: Any
-    ) -> None:
+    def __init__(self, task: Ground, parameters: Mapping[str, tuple[Any, str]], **options: Any) -> None:
         super().__init__(WORLD, task, ACTUATOR, "q", parameters, **options)
         model = self.environment.model
         base = model.body(task.base.full_identifier).id
-        kilograms = np.linspace(*loads, _ROWS)
+        kilograms = np.linspace(*LOADS_KG, _ROWS)
         rows = [load_base(model, base, load) for load in kilograms]
         on_warp = stepping.is_warp(self.environment.mjx_model)
         names = [n for n in _LOADED_FIELDS if not on_warp or stepping.varies(n)]
@@ -255,7 +254,6 @@ class WalkingModel(RobotModel):
         height_m: Height of the base at the start of an episode [m].
         terrain: Largest roughness, and where in the task's ground it is.
         make_task: Makes the composed task; True: on rough ground.
-        rooms: Contacts and rows of constraints that Warp has room for in a copy.
     """
 
     needs_gpu = True
@@ -266,12 +264,10 @@ class WalkingModel(RobotModel):
         joints: JointParameters,
         height_m: float,
         terrain: Terrain,
-        loads: tuple[float, float] = (-1.0, 3.0),
-        rooms: tuple[int, int] = (16, 96),
         rough: bool = False,
     ) -> None:
         self._make_task, self.joints, self._height_m, self._terrain = make_task, joints, height_m, terrain
-        self._loads, self._rooms, self._rough = loads, rooms, rough
+        self._rough = rough
 
     @cached_property
     def task(self) -> Ground:
@@ -292,7 +288,7 @@ class WalkingModel(RobotModel):
         """Return the parameters that are of no joint: legs in the air determine none of them."""
         return [
             Parameter(FRICTION, "1", 0.8, 0.2, 2.0, about="friction of the feet on the ground"),
-            Parameter(PAYLOAD, "kg", 0.0, *self._loads, "linear", about="load in the base"),
+            Parameter(PAYLOAD, "kg", 0.0, *LOADS_KG, "linear", about="load in the base"),
             Parameter(STRENGTH, "1", 1.0, 0.5, 1.5, about="factor on the motors' gains"),
             Parameter(ROUGHNESS, "m", 0.0, 0.0, self._terrain.most_m, "linear", about="height of bumps of the ground"),
         ]
@@ -307,9 +303,7 @@ class WalkingModel(RobotModel):
                 f"roughness must lie in [0, {most_m:g}] m, got {low:.3g} to {high:.3g}",
                 hint="`terrain = Terrain(most_m=0.2)` in the robot's file makes its ground rougher",
             )
-        return WalkingModel(
-            self._make_task, self.joints, self._height_m, self._terrain, self._loads, self._rooms, rough=True
-        )
+        return WalkingModel(self._make_task, self.joints, self._height_m, self._terrain, rough=True)
 
     def make_world(self, resumed: bool = False) -> WalkingWorld:
         del resumed
@@ -321,8 +315,8 @@ class WalkingModel(RobotModel):
             "damping": (task.joints, "damping"),
             "friction": (task.joints, "frictionloss"),
         }
-        options = {"impl": "warp", "nconmax": self._rooms[0], "njmax": self._rooms[1]} if on_gpu else {}
-        return WalkingWorld(task, places, self._loads, **options)
+        options = {"impl": "warp", "nconmax": _CONTACTS, "njmax": _ROWS_OF_CONSTRAINTS} if on_gpu else {}
+        return WalkingWorld(task, places, **options)
 
     def params(self, values: Mapping[str, Scalar], start: EpisodeStart) -> WorldParams:
         """Return the world's parameters for an episode: the base is level and at rest.

@@ -148,7 +148,6 @@ def run(robot: RecordedRobot, config: TrainConfig, root: Path, run_dir: Path | N
     path, run_dir = find_parameters(robot, config, root, run_dir)
     resume = None
     if interrupted is not None:
-        check_same_parameters(interrupted, path)
         resume = interrupted.folder / CHECKPOINT
     identification = None if path is None else check_identification(robot, config, open_identification(path, robot))
     if identification is not None:
@@ -259,16 +258,6 @@ def resumable(folder: Path) -> Iterator[Path]:
             note(f"the same command with `--resume {shown(folder)}` continues from the last evaluation")
         raise
     file.unlink(missing_ok=True)  # a finished training needs none
-
-
-def check_same_parameters(interrupted: StageFolder, path: Path | None) -> None:
-    """Raise a ``UsageError`` if the parameters at ``path`` differ from those of the interrupted training."""
-    before = interrupted.manifest.inputs.get("parameters")
-    if (before and before.sha256) != (None if path is None else sha256(path)):
-        raise UsageError(
-            f"{interrupted.folder} trains on other parameters than {path or 'the nominal ones'}",
-            hint="give the parameters of the interrupted training by --parameters, or drop --resume",
-        )
 
 
 def find_interrupted(pipeline: str, config: TrainConfig, root: Path) -> StageFolder | None:

@@ -112,7 +112,7 @@ class TrainingIdentity:
             )
         if saved["program"] != self.program:
             raise UsageError(
-                f"{path} is of another program: of another robot, world or timing, or of other versions of the code",
+                f"{path} is of another program: another robot, world, parameters, timing, or code",
                 hint="train again from the start; a resumed training must have the same of each",
             )
 
