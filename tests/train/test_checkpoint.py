@@ -67,7 +67,7 @@ def test_the_target_alone_may_be_another(saved):
     [
         ({"config": dataclasses.replace(CONFIG, gamma=0.5)}, "other settings: gamma = 0.99 there and 0.5 here"),
         ({"key": jax.random.key(4)}, "a training with another seed"),
-        ({"env": Constant(length=3)}, "of another program: of another robot"),
+        ({"env": Constant(length=3)}, "of another program"),
     ],
 )
 def test_another_training_is_refused(saved, change, message):
