@@ -1,6 +1,7 @@
 """The processes of one training, on one host or several. Imports no JAX, so ``--help`` is instant."""
 
 import re
+import socket
 from dataclasses import dataclass
 
 from sim2real.errors import UsageError
@@ -51,4 +52,21 @@ class HostsConfig:
         end = f"if one does not join, or answer, within {self.timeout_s} s, all end"
         where = "the coordinator's interfaces" if self.found else self.coordinator
         trust = f"any program that reaches {where} can join or end the training: use a network that you trust"
-        return "; ".join([name, end, *([] if self.process else [trust])])
+        return "; ".join([name, end, *([] if self.process else [trust]), *self._loopback_warning()])
+
+    def _loopback_warning(self) -> list[str]:
+        """Return a warning if process 0 listens only on the loopback, though its address names a host (Debian)."""
+        host = (self.coordinator or "").rpartition(":")[0].strip("[]")
+        if self.process != 0 or host == "localhost" or _is_loopback(host):
+            return []
+        try:
+            addresses = sorted({str(info[4][0]) for info in socket.getaddrinfo(host, None)})
+        except OSError:
+            return []  # the other processes cannot resolve it either: joining raises the error
+        if not all(map(_is_loopback, addresses)):
+            return []
+        return [f"warning: {host} is {', '.join(addresses)} here, which no other host reaches: name a network address"]
+
+
+def _is_loopback(address: str) -> bool:
+    return address.startswith("127.") or address == "::1"
