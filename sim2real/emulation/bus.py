@@ -12,7 +12,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Final, Protocol, TypeVar
+from typing import Any, Final, Protocol, TypeVar
 
 from sim2real.emulation.plant import Plant, PlantClock
 from sim2real.emulation.robot import NUMBERS, Emulation, PlannedRobot, VirtualChannel, VirtualTime
@@ -37,9 +37,6 @@ class BusEmulation(Emulation):
         frozen_after_s: Time from which reads return the position of that time, and no velocity [s]; None: never.
         unplugged_after_s: Time at which the port goes away, as with a pulled USB plug [s]; None: never.
     """
-
-    bus_type: ClassVar[Callable[..., PlannedBus[Any]]]
-    """Makes the bus from plant, settings, truth and ``send``."""
 
     baud_rate: int = 1_000_000
     sensing_jitter_s: float = 0.0
@@ -287,15 +284,12 @@ class VirtualRobot(VirtualTime):
 
     def __init__(self, plant: Plant, config: BusEmulation, truth_path: Path | None = None) -> None:
         self.plant: Any = plant
-        super().__init__(plant, config, truth_path)
-        self._baud_rate: int | None = None  # None: no host has opened the port
         self._inbox: list[bytes] = []
+        super().__init__(plant, config, truth_path, self._take)
+        self._baud_rate: int | None = None  # None: no host has opened the port
         self.bus: Any = self.planned
         self.port = f"virtual:{next(NUMBERS)}"
         EMULATED[self.port] = self._open
-
-    def make(self, physics: Plant, config: BusEmulation, log: TruthLog) -> PlannedRobot[Any]:
-        return config.bus_type(physics, config, log, self._take)
 
     def stop(self) -> None:
         EMULATED.pop(self.port, None)

@@ -59,6 +59,9 @@ class UnitreeEmulation(Emulation):
     alone_after_s: float | None = None
     alone_kd: float = 3.0
 
+    def planned(self, physics: Body, truth: TruthLog, send: Callable[[LowState], object]) -> EmulatedLegs:
+        return EmulatedLegs(physics, self, truth, send)
+
     def robot(self, physics: Body, truth_path: Path | None) -> VirtualLegs:
         return VirtualLegs(physics, self, truth_path)
 
@@ -240,14 +243,11 @@ class VirtualLegs(VirtualTime):
 
     def __init__(self, body: Body, config: UnitreeEmulation, truth_path: Path | None = None) -> None:
         self.links: list[VirtualLink] = []
-        super().__init__(body, config, truth_path)
+        super().__init__(body, config, truth_path, self._publish)
         self.legs: Any = self.planned
         self.address = Address("virtual", next(NUMBERS) % 233)
         self.port = str(self.address)
         EMULATED[self.address] = lambda mark: VirtualLink(self, mark)
-
-    def make(self, physics: Body, config: UnitreeEmulation, log: TruthLog) -> PlannedRobot[Any]:
-        return EmulatedLegs(physics, config, log, self._publish)
 
     def stop(self) -> None:
         EMULATED.pop(self.address, None)

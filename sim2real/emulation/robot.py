@@ -66,8 +66,16 @@ class Emulation:
             if is_size and value is not None and value < 0:
                 raise UsageError(f"emulator: {name} = {value} is below 0")
 
+    def planned(self, physics: Any, truth: TruthLog, send: Callable[[Any], Any]) -> PlannedRobot[Any]:
+        """Return a robot without port and clock, with these settings and a plant or body.
+
+        Args:
+            send: Delivers the bytes of an answer, or a state, to the host; returns False if the host cannot take it.
+        """
+        raise NotImplementedError
+
     def robot(self, physics: Any, truth_path: Path | None) -> VirtualTime:
-        """Return a running robot with these settings and a plant or body.
+        """Return a running robot in virtual time.
 
         Args:
             truth_path: The file of true states and latencies; None: a temporary file.
@@ -122,7 +130,7 @@ class PlannedRobot(ABC, Generic[C]):
         return self.has(self.config.silent_after_s, t_ns)
 
 
-class VirtualTime(ABC):
+class VirtualTime:
     """The clock of an emulated robot, its guardian, and the ends of its host.
 
     Attributes:
@@ -136,7 +144,7 @@ class VirtualTime(ABC):
 
     port: str
 
-    def __init__(self, physics: Any, config: Emulation, truth_path: Path | None) -> None:
+    def __init__(self, physics: Any, config: Emulation, truth_path: Path | None, send: Callable[[Any], Any]) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="sim2real-robot-")
         self.truth_path = Path(self._folder.name) / "truth.bin" if truth_path is None else truth_path
         self.clock: Clock = self
@@ -147,11 +155,7 @@ class VirtualTime(ABC):
         self._calling = False
         self._guard: Guard | None = None
         self._log = TruthLog(self.truth_path, truth_header(physics, config))
-        self.planned = self.make(physics, config, self._log)
-
-    @abstractmethod
-    def make(self, physics: Any, config: Any, log: TruthLog) -> PlannedRobot[Any]:
-        """Return the robot in planned time."""
+        self.planned = config.planned(physics, self._log, send)
 
     def __enter__(self) -> Self:
         return self

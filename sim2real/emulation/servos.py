@@ -315,14 +315,15 @@ class ServoEmulation(BusEmulation, ABC):
         cut: Probability that an answer ends after its fourth byte.
     """
 
-    bus_type = ServoBus
-
     wrong_id: float = 0.0
     cut: float = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.require({"wrong_id": (0.0, 1.0), "cut": (0.0, 1.0)})
+
+    def planned(self, physics: Plant, truth: TruthLog, send: Callable[[bytes], bool]) -> ServoBus:
+        return ServoBus(physics, self, truth, send)
 
     @abstractmethod
     def servo(self, servo_id: int) -> ServoFirmware:

@@ -8,22 +8,13 @@ from typing import Final, Protocol
 
 
 class Clock(Protocol):
-    """The time of a device and of everything that watches it."""
+    """The time of a device and of everything that watches it; `sleep` returns after a time [s]."""
 
-    def now_ns(self) -> int:
-        """Return the time [ns]."""
-        ...
-
-    def sleep(self, duration_s: float) -> None:
-        """Return after a time [s]."""
-        ...
+    def now_ns(self) -> int: ...
+    def sleep(self, duration_s: float) -> None: ...
 
     def repeat(self, call: Callable[[], None], period_s: float, done: threading.Event, name: str) -> None:
-        """Call a function now and after every period until ``done`` is set, beside the caller.
-
-        Args:
-            call: Raises nothing.
-        """
+        """Call a function, which raises nothing, now and after every period until ``done`` is set, beside the caller."""
         ...
 
 

@@ -245,5 +245,5 @@ class DynamixelServos(Servos):
 
 
 def servos(port: str, ids: Sequence[int], drive: Any, *, baud_rate: int, silence_s: float) -> DynamixelServos:
-    """Return servos on a port, not opened yet: the device of the name ``dynamixel``; see ``DeviceFactory``."""
+    """Return servos on a port, not opened yet: the device of the name ``dynamixel``; see ``load_device``."""
     return DynamixelServos(BusConfig.patient(port, baud_rate, silence_s), ids, drive)

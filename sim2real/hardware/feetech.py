@@ -206,5 +206,5 @@ class StsServos(Servos):
 
 
 def servos(port: str, ids: Sequence[int], drive: PositionDrive, *, baud_rate: int, silence_s: float) -> StsServos:
-    """Return servos on a port, not opened yet: the device of the name ``feetech``; see ``DeviceFactory``."""
+    """Return servos on a port, not opened yet: the device of the name ``feetech``; see ``load_device``."""
     return StsServos(BusConfig.patient(port, baud_rate, silence_s), ids, drive)

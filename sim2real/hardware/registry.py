@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from importlib import metadata
-from typing import TYPE_CHECKING, Any, Final, Protocol, cast
+from typing import TYPE_CHECKING, Any, Final
 
 from sim2real.errors import UsageError
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from sim2real.hardware.device import Device
 
 DEVICES: Final = "sim2real.devices"
-"""The entry point group of devices, see `DeviceFactory`."""
+"""The entry point group of devices, see `load_device`."""
 WORLDS: Final = "sim2real.worlds"
 """The entry point group of worlds, see `sim2real.robots.robot`."""
 BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = {
@@ -32,24 +32,17 @@ def available(group: str = DEVICES) -> dict[str, Any]:
     return {**BUILT_IN[group], **{entry.name: entry for entry in metadata.entry_points(group=group)}}
 
 
-class DeviceFactory(Protocol):
-    """Makes the device of a name, not opened yet."""
+def load_device(name: str) -> Callable[..., Device]:
+    """Return what makes the device of a name, not opened yet: ``make(port, ids, drive, *, baud_rate, silence_s)``.
 
-    def __call__(self, port: str, ids: Sequence[Any], drive: Any, *, baud_rate: int, silence_s: float) -> Device:
-        """Return the device.
+    ``port`` is its connection, such as a serial port's device file; ``ids`` are the motors' numbers, in the order of
+    the joints; ``drive`` has settings of a type that robot and device agree on; ``silence_s`` is the longest time
+    without an instruction while torque is on [s].
 
-        Args:
-            port: Its connection, e.g. a serial port's device file.
-            ids: The motors' numbers, in the order of the joints.
-            drive: Settings of the motors, of a type that the robot and the device agree on.
-            silence_s: Longest time without an instruction while torque is on [s].
-        """
-        ...
-
-
-def load_device(name: str) -> DeviceFactory:
-    """Return the factory of a device; raise UsageError if there is none of this name, or it cannot be imported."""
-    return cast(DeviceFactory, load_entry("device", name, DEVICES, "hardware.registry.DeviceFactory"))
+    Raises:
+        UsageError: There is none of this name, or it cannot be imported.
+    """
+    return load_entry("device", name, DEVICES, "hardware.registry.load_device")
 
 
 def load_entry(what: str, name: str, group: str, contract: str) -> Callable[..., Any]:

@@ -16,7 +16,7 @@ class VirtualBus:
         self.sent = []
         self._path = path
         self._log = TruthLog(path, truth_header(self.plant, config))
-        self.bus = type(config).bus_type(self.plant, config, self._log, self._take)
+        self.bus = config.planned(self.plant, self._log, self._take)
         self.servos = self.bus.servos
 
     def _take(self, answer):
@@ -58,6 +58,11 @@ class Idle(PlannedRobot):
     def run_until(self, t_ns): ...
 
 
+class IdleEmulation(Emulation):
+    def planned(self, physics, truth, send):
+        return Idle(self, truth)
+
+
 class Nothing:
     def state(self):
         return {}
@@ -69,10 +74,7 @@ class IdleTime(VirtualTime):
     """Virtual time in which nothing happens by itself."""
 
     def __init__(self):
-        super().__init__(Nothing(), Emulation(), None)
-
-    def make(self, physics, config, log):
-        return Idle(config, log)
+        super().__init__(Nothing(), IdleEmulation(), None, None)
 
 
 class IdleDevice(Device):

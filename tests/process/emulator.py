@@ -70,14 +70,11 @@ class Pty:
         os.set_blocking(self.fd, False)
         self.port, self.inputs = os.ttyname(self._host_fd), [self.fd]
 
-    def make(self, plant, config, truth):
-        return config.bus_type(plant, config, truth, self._send)
-
     def exchange(self, robot, now_ns):
         with suppress(BlockingIOError):
             robot.feed(os.read(self.fd, 4096), now_ns)
 
-    def _send(self, answer):
+    def send(self, answer):
         try:
             return os.write(self.fd, answer) == len(answer)
         except BlockingIOError:
@@ -103,12 +100,7 @@ class Dds:
         self.port, self._network = str(address), Domain(domain, address.config)
         participant = DomainParticipant(domain)
         self._reader = DataReader(participant, Topic(participant, COMMAND_TOPIC, LowCmd))
-        self._write = DataWriter(participant, Topic(participant, STATE_TOPIC, LowState)).write
-
-    def make(self, body, config, truth):
-        from sim2real.emulation.legs import EmulatedLegs
-
-        return EmulatedLegs(body, config, truth, self._write)
+        self.send = DataWriter(participant, Topic(participant, STATE_TOPIC, LowState)).write
 
     def exchange(self, robot, now_ns):
         """Pass the host's commands on; they count from the time at which they were written."""
@@ -172,7 +164,7 @@ def main(task):
     now = lambda: time.monotonic_ns() - start_ns  # noqa: E731 - the robot's time
     truth = LiveTruth(Path(task["truth"]), truth_header(plant, config))
     truth.start_ns = start_ns
-    robot = connection.make(plant, config, truth)
+    robot = config.planned(plant, truth, connection.send)
     print(json.dumps({"port": connection.port}), flush=True)
     flushed_ns = 0
     while not ends:

@@ -55,24 +55,20 @@ _QUIET_NS, _LONGEST_ANSWER_NS = 2_000_000, 20_000_000
 
 
 class Line(Protocol):
-    """Bytes from and to a device, on the device's clock. Every method may be called from any thread."""
+    """Bytes from and to a device, on the device's clock. Every method may be called from any thread.
+
+    `write` sends bytes without waiting. `read` returns the bytes that have arrived; none if there are none until a time
+    [ns]. Both raise OSError if the port is gone.
+    """
 
     @property
-    def clock(self) -> Clock:
-        """The time of the device."""
-        ...
-
-    def write(self, data: bytes) -> None:
-        """Send bytes without waiting; OSError if that cannot be done."""
-        ...
-
-    def read(self, until_ns: int) -> bytes:
-        """Return the bytes that have arrived; none if there are none until a time [ns]; OSError if the port is gone."""
-        ...
+    def clock(self) -> Clock: ...
+    def write(self, data: bytes) -> None: ...
+    def read(self, until_ns: int) -> bytes: ...
 
 
 class Port(Line, Protocol):
-    """A line that is open alone.
+    """A line that is open alone; `flush` drops the bytes that have arrived.
 
     Attributes:
         advice: What to look at if answers are missing or late, as the end of a hint.
@@ -80,13 +76,8 @@ class Port(Line, Protocol):
 
     advice: str
 
-    def flush(self) -> None:
-        """Drop the bytes that have arrived; OSError if the port is gone."""
-        ...
-
-    def close(self) -> None:
-        """Close the port; OSError if that cannot be done."""
-        ...
+    def flush(self) -> None: ...
+    def close(self) -> None: ...
 
     def guardian(self, off: bytes, servos: Queries, silence_s: float, answer_s: float) -> Guardian:
         """Return a guardian of the servos on this port, which has started.

@@ -419,6 +419,6 @@ def guarded(address: str, mark: str, damping: str, lie_s: str) -> Motors:
 
 
 def legs(port: str, ids: Sequence[int], drive: Any, *, baud_rate: int, silence_s: float) -> UnitreeLegs:
-    """Return the legs of a Go2, not opened yet: the device of the name ``unitree``; see ``DeviceFactory``."""
+    """Return the legs of a Go2, not opened yet: the device of the name ``unitree``; see ``load_device``."""
     del baud_rate  # a network has none
     return UnitreeLegs(port, ids, drive, silence_s=silence_s, max_silence_s=max(0.1, silence_s))

@@ -143,4 +143,7 @@ class ODriveEmulation(BusEmulation):
     """Settings of an emulated ODrive on a serial line."""
 
     baud_rate: int = 115_200
-    bus_type = Board
+
+    def planned(self, physics: Plant, truth: TruthLog, send: Callable[[bytes], bool]) -> Board:
+        """Return the board."""
+        return Board(physics, self, truth, send)
