@@ -14,7 +14,7 @@ class Clock(Protocol):
     def sleep(self, duration_s: float) -> None: ...
 
     def repeat(self, call: Callable[[], None], period_s: float, done: threading.Event, name: str) -> None:
-        """Call a function, which raises nothing, now and after every period until ``done`` is set, beside the caller."""
+        """Call a function that raises nothing, now and after every period until ``done`` is set, beside the caller."""
         ...
 
 

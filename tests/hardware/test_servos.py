@@ -203,7 +203,7 @@ def test_goals_outside_the_range_are_refused(angle):
     joints = [Joint("pan", 1, low_count=1700, high_count=4000), Joint("lift", 2), Joint("elbow", 3)]
     with feetech(STS.robot(), joints) as device:
         low, high = device.reach()
-        assert (low[0], high[0]) == pytest.approx(joints[0].range_rad, abs=0.51 * COUNT_RAD)
+        assert (low[0], high[0]) == pytest.approx((joints[0].angle(1700), joints[0].angle(4000)), abs=0.51 * COUNT_RAD)
         with pytest.raises(SafetyStop, match=r"joint 'pan': .* rad is outside"):
             device.command(np.array([angle, 0.0, 0.0]))
 

@@ -121,6 +121,6 @@ def test_the_calibration_is_the_embedded_arms():
     joints = MODULE.read(PIPELINE.folder / "calibration.json")
     for joint, zero in zip(joints, PLANT.ZERO_COUNTS, strict=True):
         assert joint.zero_count + joint.homing_offset == pytest.approx(zero, abs=0.5)
-        low, high = joint.range_rad
+        low, high = sorted(joint.angle(count) for count in (joint.low_count, joint.high_count))
         i = ROBOT.drive.servos.joints.index(joint.name)
         assert low < LOW[i] < HIGH[i] < high

@@ -3,8 +3,7 @@
 import atexit
 import logging
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Final
 
@@ -76,19 +75,9 @@ class ServoJoint:
         """Change of the angle with the count [rad]."""
         return self.direction * 2.0 * math.pi / self.counts
 
-    @property
-    def range_rad(self) -> tuple[float, float]:
-        """Lowest and highest angle [rad]."""
-        ends = sorted(self.angle(count) for count in (self.low_count, self.high_count))
-        return ends[0], ends[1]
-
     def angle(self, count: float) -> float:
         """Return the joint's angle [rad] at a count of its servo."""
         return (count - self.zero_count) * self.rad_per_count
-
-    def count(self, angle_rad: float) -> int:
-        """Return the servo's count nearest to an angle of the joint [rad]."""
-        return round(self.zero_count + angle_rad / self.rad_per_count)
 
 
 @dataclass(frozen=True)
@@ -351,7 +340,7 @@ class Servos(Device):
         self.armed = True
         if link.at_rest:
             self.armed = False
-            raise SafetyStop("torque stays off: the servos have been made safe", hint="open them again")
+            raise _made_safe()
         return (goals - self._zero) * self._unit
 
     def measure(self) -> Reading:
@@ -426,12 +415,18 @@ class Servos(Device):
         Raises:
             HardwareLost: A servo does not confirm; the others were switched off.
         """
-        with self._unguarded():
-            if unconfirmed := self._release(self.ids):
-                raise HardwareLost(
-                    f"servos {unconfirmed} on {self.config.port} do not confirm that their torque is off",
-                    hint="cut their power",
-                )
+        link = self.link
+        self.armed, link.at_rest = False, True
+        guardian = link.guardian
+        if guardian is not None and not guardian.settle():
+            guardian.disarm()  # it has taken over or died: take the torque off all the same
+        if unconfirmed := self._release(self.ids):
+            raise HardwareLost(
+                f"servos {unconfirmed} on {self.config.port} do not confirm that their torque is off",
+                hint="cut their power",
+            )
+        if guardian is not None:
+            guardian.disarm()
 
     def make_safe(self) -> None:
         """Take the torque off without a lock and without waiting for answers: for signal handlers and watchdog threads.
@@ -483,22 +478,10 @@ class Servos(Device):
         self.link.send_off()
         return [servo_id for servo_id in servo_ids if not self.release(servo_id)]
 
-    @contextmanager
-    def _unguarded(self) -> Iterator[None]:
-        """Take the torque off in this block: the guardian watches until its end, unless it has acted already."""
-        self.armed = False
-        self.link.at_rest = True
-        guardian = self.link.guardian
-        if guardian is not None and not guardian.settle():
-            guardian.disarm()  # it has taken over or died: take the torque off all the same
-        yield
-        if guardian is not None:
-            guardian.disarm()
-
     def _guard(self) -> None:
         """Arm the guardian before torque goes on; start it at the first call."""
         if self.halted:
-            raise SafetyStop("torque stays off: the servos have been made safe", hint="open them again")
+            raise _made_safe()
         link = self.link
         if self.config.guardian:
             if link.guardian is None:
@@ -509,7 +492,7 @@ class Servos(Device):
         link.at_rest = False
         if self.halted:  # in another thread, or by a signal
             link.at_rest = True
-            raise SafetyStop("torque stays off: the servos have been made safe", hint="open them again")
+            raise _made_safe()
 
     # -- one servo
 
@@ -567,3 +550,7 @@ class Servos(Device):
                 hint="move it by hand, or calibrate again",
             )
         return goal
+
+
+def _made_safe() -> SafetyStop:
+    return SafetyStop("torque stays off: the servos have been made safe", hint="open them again")
