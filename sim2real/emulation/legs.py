@@ -46,9 +46,6 @@ class UnitreeEmulation(Emulation):
         gyro_noise_rad_s: Deviation of the noise of the gyro [rad/s].
         tilt_noise_rad: Deviation of the noise of the orientation, about each axis [rad].
         accelerometer_noise_m_s2: Deviation of the noise of the accelerometer [m/s^2].
-        alone_after_s: Time without an intact command after which motors damp their joints [s]; None: they go on as
-            commanded last, the worst that is possible: Unitree documents no reaction.
-        alone_kd: Damping of the joints then [N m s/rad].
     """
 
     position_noise_rad: float = 0.0003
@@ -56,8 +53,6 @@ class UnitreeEmulation(Emulation):
     gyro_noise_rad_s: float = 0.01
     tilt_noise_rad: float = 0.002
     accelerometer_noise_m_s2: float = 0.05
-    alone_after_s: float | None = None
-    alone_kd: float = 3.0
 
     def planned(self, physics: Body, truth: TruthLog, send: Callable[[LowState], object]) -> EmulatedLegs:
         return EmulatedLegs(physics, self, truth, send)
@@ -67,7 +62,8 @@ class UnitreeEmulation(Emulation):
 
 
 class EmulatedLegs(PlannedRobot[UnitreeEmulation]):
-    """Motors and IMU of a body.
+    """Motors and IMU of a body. Without a host they go on as commanded last, the worst that is possible: Unitree
+    documents no reaction.
 
     Args:
         send: Sends a state; None: nobody gets any.
@@ -89,9 +85,7 @@ class EmulatedLegs(PlannedRobot[UnitreeEmulation]):
         self._step_ns = round(1e9 * body.step_s)
         self._index = 0
         self._coming: deque[tuple[int, int, np.ndarray, np.ndarray]] = deque()
-        self._modes, self._law = np.zeros(body.motors, np.uint8), np.zeros((body.motors, len(COLUMNS)))
-        self._heard_ns: int | None = None
-        self._damps = False
+        self._modes = np.zeros(body.motors, np.uint8)
         self.ignored = 0
         # States that wait to be sent, until when they are held up, and when the next one is due.
         self._waiting: deque[tuple[LowState, int]] = deque()
@@ -136,9 +130,6 @@ class EmulatedLegs(PlannedRobot[UnitreeEmulation]):
             # if its force had acted half a step earlier.
             while self._coming and self._coming[0][0] <= now_ns:
                 self._apply(*self._coming.popleft())
-            alone_s = self.config.alone_after_s
-            if self._heard_ns is not None and alone_s is not None and now_ns - self._heard_ns > 1e9 * alone_s:
-                self._damp(now_ns)
             self._body.step()
             self._index += 1
             self._remember()
@@ -195,7 +186,7 @@ class EmulatedLegs(PlannedRobot[UnitreeEmulation]):
         law[modes != SERVO] = 0.0
         law[~np.isfinite(law).all(axis=1)] = 0.0
         changed = modes != self._modes
-        self._modes, self._law, self._heard_ns, self._damps = modes, law, t_ns, False
+        self._modes = modes
         driven = law.copy()
         if self.has(self.config.lets_go_after_s, self._now_ns()):
             driven[self.config.lets_go] = 0.0
@@ -205,15 +196,6 @@ class EmulatedLegs(PlannedRobot[UnitreeEmulation]):
         for i in np.flatnonzero(changed).tolist():
             values = float(modes[i]), float(q[i]), float(kp[i])
             self.truth.write(Kind.EFFECT, i, t_ns, acts_ns, acts_ns, acts_ns - effect_ns, values)
-
-    def _damp(self, now_ns: int) -> None:
-        """Let the motors that are on damp their joints, as the host is silent."""
-        if self._damps:
-            return
-        self._damps, law = True, np.zeros_like(self._law)
-        law[self._modes == SERVO, COLUMNS.index("kd")] = self.config.alone_kd
-        self._body.drive(law)
-        self.truth.write(Kind.WATCHDOG, 0, self._heard_ns or 0, now_ns, now_ns, 0)
 
     def _now_ns(self) -> int:
         return self._index * self._step_ns

@@ -62,7 +62,7 @@ class Emulation:
         self.require({name: (0.0, 1.0) for name in ("reply_loss", "corrupt", "late", "late_s")})
         self.require({"actuation_jitter_s": (0.0, self.actuation_latency_s)})
         for name, value in asdict(self).items():
-            is_size = name.endswith(("_s", "_kd")) or "noise" in name
+            is_size = name.endswith("_s") or "noise" in name
             if is_size and value is not None and value < 0:
                 raise UsageError(f"emulator: {name} = {value} is below 0")
 
@@ -250,8 +250,6 @@ class VirtualTime:
 
 class VirtualChannel:
     """The host's end of the connection to a guardian in virtual time; a `Channel`."""
-
-    pid = 0
 
     def __init__(self, robot: VirtualTime, motors: Motors, longest_s: float) -> None:
         self.clock: Clock = robot

@@ -85,7 +85,7 @@ class _Legs(Family):
     def robot(self, plant: str = "", settings: Mapping[str, Any] | None = None, **plant_args: Any) -> Any:
         from sim2real.emulation.legs import VirtualLegs
 
-        return VirtualLegs(Go2Body("stand"), self.emulation(alone_after_s=None, **(settings or {})))
+        return VirtualLegs(Go2Body("stand"), self.emulation(**(settings or {})))
 
     def on(self, robot: Any) -> list[int]:
         return np.flatnonzero(robot.legs._modes).tolist()

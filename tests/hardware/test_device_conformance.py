@@ -70,4 +70,4 @@ class TestUnitreeLegs(DeviceConformance):
         from sim2real.emulation.legs import UnitreeEmulation, VirtualLegs
 
         # Its motors go on when their host dies: the guardian must cope with that.
-        return VirtualLegs(Go2Body("floor"), UnitreeEmulation(alone_after_s=None, **settings), truth_path)
+        return VirtualLegs(Go2Body("floor"), UnitreeEmulation(**settings), truth_path)

@@ -44,7 +44,7 @@ signal.signal(signal.SIGUSR1, die_in_the_middle_of_a_packet)
 bus.enable()
 goals = np.full(3, 0.7)
 bus.command(goals)
-print(bus.link.guardian.pid, flush=True)
+print(bus.link.guardian._channel.pid, flush=True)
 try:
     while True:
         bus.command(goals)

@@ -151,7 +151,7 @@ with Rig(device, gate) as rig:
     ],
 )
 def test_a_robot_that_stands_sinks_before_its_motors_switch_off(tmp_path, number):
-    config, log = UnitreeEmulation(alone_after_s=None), tmp_path / "log.mcap"
+    config, log = UnitreeEmulation(), tmp_path / "log.mcap"
     robot = EmulatedProcess(BODY, config, {"place": "floor"}, tmp_path / "truth.bin")
     code = HOST.format(port=robot.port, log=str(log))
     host = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)

@@ -167,7 +167,6 @@ class Channel(Protocol):
     guardian's end, and kills it after a time [s]; 0: it does not wait.
     """
 
-    pid: int
     clock: Clock
 
     def send(self, message: bytes) -> None: ...
@@ -265,11 +264,6 @@ class Guardian:
             self._channel.close(_KILL_S)
             raise HardwareLost("the guardian does not start", hint="torque stays off without it")
         self._messages = b""
-
-    @property
-    def pid(self) -> int:
-        """The guardian's process id."""
-        return self._channel.pid
 
     @property
     def took_over(self) -> bool:

@@ -25,7 +25,7 @@ MIXED = (3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8)
 @pytest.fixture
 def robot(tmp_path, request):
     body = Go2Body(getattr(request, "param", "floor"))
-    served = VirtualLegs(body, UnitreeEmulation(alone_after_s=None), tmp_path / "truth.bin")
+    served = VirtualLegs(body, UnitreeEmulation(), tmp_path / "truth.bin")
     yield served
     served.stop()
 
