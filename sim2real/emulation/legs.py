@@ -62,8 +62,7 @@ class UnitreeEmulation(Emulation):
 
 
 class EmulatedLegs(PlannedRobot[UnitreeEmulation]):
-    """Motors and IMU of a body. Without a host they go on as commanded last, the worst that is possible: Unitree
-    documents no reaction.
+    """Motors and IMU of a body. Without a host they go on as commanded last: the worst, as no reaction is documented.
 
     Args:
         send: Sends a state; None: nobody gets any.

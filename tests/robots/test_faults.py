@@ -40,6 +40,7 @@ FAULTS = {
     "killed": (None, dict.fromkeys(ROBOTS, "is gone: torque is off"), 0.3),
     "stopped": (SafetyStop, dict.fromkeys(ROBOTS, "guardian"), 0.3),
     "no guardian": (SafetyStop, dict.fromkeys(ROBOTS, "guardian has died"), SOON_S),
+    "torque off": (SafetyStop, {"pendulum": "hinge.*push", "arm": "(shoulder|elbow).*away", "so101": "has lost"}, 0.6),
     "lets go": (SafetyStop, {name: f"{joint}.*(away|push)" for name, joint in JOINT.items()}, FOLLOWS_S),
     "slips": (SafetyStop, {n: f"{j}.*(away|push)" for n, j in JOINT.items() if n != "go2"}, 1.0),
     "collides": (SafetyStop, {n: f"{j}.*(away|push|has read)" for n, j in JOINT.items() if n != "go2"}, 1.2),
@@ -95,6 +96,11 @@ class Strike:
         elif self.fault == "restarts":
             servo_id = self.robot.id
             emulated.write(self.rig.device.link.form.build(servo_id, Instruction.REBOOT))
+        elif self.fault == "torque off":  # of the faulty joint and the one after it, by another program
+            for i in [i for i in emulated.bus.servos if i in (self.robot.id, self.robot.id + 1)]:
+                servo = emulated.bus.servos[i]
+                servo._goal_wakes = False  # otherwise the next goal switches it on again
+                emulated.write(servo.family.form.write(i, servo.family.torque, 0))
         elif self.fault == "stopped":
             emulated.stall(1.0)
         elif self.fault == "killed":
