@@ -11,6 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
+from types import MappingProxyType
 from typing import Final, Literal, Self, TypeAlias
 
 import numpy as np
@@ -208,7 +209,24 @@ class Device(ABC):
 
     Methods raise HardwareLost when the device does not answer within its limits, and SafetyStop when a motor has
     stopped itself or the torque was taken off from outside.
+
+    Attributes:
+        motors: Names of the motors, for messages, e.g. ``servo 1``. This and the following ones hold also before it is
+            opened.
+        commanded: The quantity of a command.
+        silence_s: Longest time without an instruction while torque is on, after which it is taken off [s]; 0:
+            unlimited.
+        load_unit: Unit of a reading's load; by default a share of the largest.
+        parts: Name -> further part of a reading.
+        clock: The clock of the stamps of readings, and of everything that watches the device; once it is open.
     """
+
+    motors: tuple[str, ...]
+    commanded: CommandKind
+    silence_s: float
+    load_unit: str = "1"
+    parts: Mapping[str, ReadingPart] = MappingProxyType({})
+    clock: Clock = SYSTEM_CLOCK
 
     def __enter__(self) -> Self:
         """Open the device, with torque off."""
@@ -218,38 +236,6 @@ class Device(ABC):
     def __exit__(self, *exception: object) -> None:
         """Take the torque off and close the device."""
         self.close()
-
-    # -- properties, also before it is opened
-
-    @property
-    @abstractmethod
-    def motors(self) -> tuple[str, ...]:
-        """Names of the motors, for messages, e.g. ``servo 1``."""
-
-    @property
-    @abstractmethod
-    def commanded(self) -> CommandKind:
-        """The quantity of a command."""
-
-    @property
-    @abstractmethod
-    def silence_s(self) -> float:
-        """Longest time without an instruction while torque is on, after which it is taken off [s]; 0: unlimited."""
-
-    @property
-    def load_unit(self) -> str:
-        """Unit of a reading's load; default: a share of the largest."""
-        return "1"
-
-    @property
-    def parts(self) -> Mapping[str, ReadingPart]:
-        """Name -> further part of a reading; default: none."""
-        return {}
-
-    @property
-    def clock(self) -> Clock:
-        """The clock of the stamps of readings, and of everything that watches the device; default: the machine's."""
-        return SYSTEM_CLOCK
 
     # -- from open to close
 

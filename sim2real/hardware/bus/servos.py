@@ -14,7 +14,6 @@ from sim2real.hardware.bus.link import ServoLink
 from sim2real.hardware.bus.packets import BROADCAST_ID, Answer, Instruction
 from sim2real.hardware.bus.port import BusConfig
 from sim2real.hardware.bus.registers import Family, Register, ServoModel
-from sim2real.hardware.clock import SYSTEM_CLOCK, Clock
 from sim2real.hardware.device import (
     POSITION,
     RESPONSE_S,
@@ -157,6 +156,7 @@ class Servos(Device):
         if drive.kind not in family.modes:
             raise UsageError(f"{family.name} servos take no {drive.kind.name}")
         self.config, self.drive = config, drive
+        self.commanded, self.silence_s = drive.kind, config.silence_s
         self._mode, self.goal = family.modes[drive.kind]
         follows = isinstance(drive, PositionDrive)
         plain = {joint.servo_id: joint for joint in (drive.joints if follows else ())}
@@ -165,6 +165,7 @@ class Servos(Device):
             plain.get(j) or ServoJoint(f"servo {j}", j, middle) if isinstance(j, int) else j for j in joints
         )
         self.ids = tuple(joint.servo_id for joint in self.joints)
+        self.motors = tuple(f"servo {i}" for i in self.ids)
         if not self.ids or len(set(self.ids)) < len(self.ids) or not all(0 <= i < BROADCAST_ID for i in self.ids):
             raise UsageError(
                 f"servos {list(self.ids)}: there must be at least one, each with an id of its own, from 0 to "
@@ -224,27 +225,11 @@ class Servos(Device):
     # -- properties
 
     @property
-    def commanded(self) -> CommandKind:
-        return self.drive.kind
-
-    @property
     def link(self) -> ServoLink:
         """The link, once it is open."""
         if self._link is None:
             raise HardwareLost(f"the servos on {self.config.port} are not open", hint="call open first")
         return self._link
-
-    @property
-    def motors(self) -> tuple[str, ...]:
-        return tuple(f"servo {i}" for i in self.ids)
-
-    @property
-    def clock(self) -> Clock:
-        return SYSTEM_CLOCK if self._link is None else self._link.clock
-
-    @property
-    def silence_s(self) -> float:
-        return self.config.silence_s
 
     @property
     def counters(self) -> Counters:
@@ -274,6 +259,7 @@ class Servos(Device):
         self.models = {}
         self._link = ServoLink(self.config, self.family, self.failure)
         self._link.off_packet = self._off_packet
+        self.clock = self._link.clock
         atexit.register(self.close)
         try:
             for joint in self.joints:

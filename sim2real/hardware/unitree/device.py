@@ -15,7 +15,6 @@ from typing import Any, Final
 import numpy as np
 
 from sim2real.errors import HardwareLost, SafetyStop, UsageError
-from sim2real.hardware.clock import SYSTEM_CLOCK, Clock
 from sim2real.hardware.device import (
     CommandColumn,
     CommandKind,
@@ -78,6 +77,9 @@ class UnitreeLegs(Device):
         UsageError: A motor is missing, or the port has no domain.
     """
 
+    load_unit = "N m"  # a motor estimates its torque
+    parts = PARTS
+
     def __init__(
         self,
         port: str,
@@ -90,26 +92,9 @@ class UnitreeLegs(Device):
         if sorted(ids) != list(range(MOTORS)):
             raise UsageError(f"motors {list(ids)}: a Go2 has the motors 0 to {MOTORS - 1}, each once")
         self.address, self.drive = Address.parse(port), drive or LegDrive()
-        self._silence_s, self._max_silence_s = silence_s, max_silence_s
-        self._places = np.array(ids)
-        self._damp = self.drive.damp()  # built here, as make_safe must not need any time
-        self._clock: Clock = SYSTEM_CLOCK
-        self._stream: StateStream | None = None  # the open connection
-        self._guardian: Guardian | None = None
-        self.armed = self.halted = False
-        self._on = self._leaving = False
-        self._published = 0
-        self._commanding = threading.Lock()
-
-    @property
-    def motors(self) -> tuple[str, ...]:
-        """Names of the motors: ``FR_hip``, ``FR_thigh``, ..."""
-        return tuple(NAMES[i] for i in self._places)
-
-    @property
-    def commanded(self) -> CommandKind:
-        """The columns q, dq, kp, kd and tau; a stale command damps the joint."""
-        return CommandKind.of_columns(
+        self.silence_s, self._max_silence_s = silence_s, max_silence_s
+        self.motors, self._places = tuple(NAMES[i] for i in ids), np.array(ids)
+        self.commanded = CommandKind.of_columns(
             "controllers",
             CommandColumn("q", "rad", "hold"),
             CommandColumn("dq", "rad/s", "zero"),
@@ -117,23 +102,13 @@ class UnitreeLegs(Device):
             CommandColumn("kd", "N m s/rad", self.drive.damping),
             CommandColumn("tau", "N m", "zero"),
         )
-
-    @property
-    def silence_s(self) -> float:
-        return self._silence_s
-
-    @property
-    def load_unit(self) -> str:
-        """Unit of the torque that a motor estimates."""
-        return "N m"
-
-    @property
-    def parts(self) -> Mapping[str, ReadingPart]:
-        return PARTS
-
-    @property
-    def clock(self) -> Clock:
-        return self._clock
+        self._damp = self.drive.damp()  # built here, as make_safe must not need any time
+        self._stream: StateStream | None = None  # the open connection
+        self._guardian: Guardian | None = None
+        self.armed = self.halted = False
+        self._on = self._leaving = False
+        self._published = 0
+        self._commanding = threading.Lock()
 
     @property
     def stream(self) -> StateStream:
@@ -158,7 +133,7 @@ class UnitreeLegs(Device):
         self._published = 0
         mark = f"sim2real {uuid.uuid4().hex[:8]} of process {os.getpid()}"
         robot = connect(self.address, mark)
-        self._clock = robot.clock
+        self.clock = robot.clock
         try:
             # States must come, and no other writer may command the motors.
             stream = StateStream(robot, self._max_silence_s)
@@ -304,7 +279,7 @@ class UnitreeLegs(Device):
             raise SafetyStop("torque stays off: the legs have been made safe", hint="open the robot again")
         # The guardian watches before the first command.
         if self._guardian is None:
-            self._guardian = robot.guardian(self.drive, self._silence_s, self.drive.lie_s + _SETTLE_S)
+            self._guardian = robot.guardian(self.drive, self.silence_s, self.drive.lie_s + _SETTLE_S)
         _require_alone(robot, SafetyStop)
         self._guardian.arm()
         # Commands may be lost, so each state is answered with one until all motors are on.

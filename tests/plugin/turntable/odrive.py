@@ -14,7 +14,6 @@ import numpy as np
 
 from sim2real.errors import HardwareLost, SafetyStop, UsageError
 from sim2real.hardware.bus.port import Port, open_port
-from sim2real.hardware.clock import SYSTEM_CLOCK, Clock
 from sim2real.hardware.device import CommandKind, Counters, Device, Reading, Transaction
 
 SPEED = CommandKind("speeds", "rad/s", stale="zero")
@@ -85,10 +84,13 @@ class ODrive(Device):
         UsageError: Another axis is requested.
     """
 
+    motors = ("axis 0",)
+    commanded = SPEED
+
     def __init__(self, port: str, ids: Sequence[int], drive: SpeedLoop, *, baud_rate: int, silence_s: float) -> None:
         if tuple(ids) != (0,):
             raise UsageError(f"axes {list(ids)}: this driver knows axis 0 alone")
-        self._port, self._loop, self._baud_rate, self._silence_s = port, drive, baud_rate, silence_s
+        self._port, self._loop, self._baud_rate, self.silence_s = port, drive, baud_rate, silence_s
         self._line: Port | None = None
         self._lock = threading.Lock()
         self._halted = self._on = False
@@ -98,31 +100,11 @@ class ODrive(Device):
 
     # -- its description
 
-    @property
-    def motors(self) -> tuple[str, ...]:
-        """Its name."""
-        return ("axis 0",)
-
-    @property
-    def commanded(self) -> CommandKind:
-        """Speeds."""
-        return SPEED
-
-    @property
-    def silence_s(self) -> float:
-        """Time without a command after which the board takes the torque off [s]."""
-        return self._silence_s
-
-    @property
-    def clock(self) -> Clock:
-        """The clock of the port: all waiting and all stamps are on it."""
-        return SYSTEM_CLOCK if self._line is None else self._line.clock
-
     def without_host(self) -> tuple[str, ...]:
         """Return what firmware 0.5 does: it disarms an axis that is not fed (axis.config.watchdog_timeout)."""
-        if not self._silence_s:
+        if not self.silence_s:
             return ("ODrive v3 (axis 0) goes on as commanded last (its watchdog is not enabled)",)
-        return (f"ODrive v3 (axis 0) takes its torque off after {self._silence_s:g} s",)
+        return (f"ODrive v3 (axis 0) takes its torque off after {self.silence_s:g} s",)
 
     def reach(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the board's limit of speed, either way [rad/s]."""
@@ -139,14 +121,15 @@ class ODrive(Device):
     def open(self) -> None:
         """Open the port, find the board, take the torque off, and write the settings."""
         self._line = open_port(self._port, self._baud_rate)
+        self.clock = self._line.clock  # all waiting and all stamps are on it
         self._halted = self._on = False
         try:
             self.disable()
             self._tell("sc")  # errors of an earlier session
             for name, value in self._loop.properties().items():
                 self._set(name, value)
-            if self._silence_s:
-                self._set("axis0.config.watchdog_timeout", self._silence_s)
+            if self.silence_s:
+                self._set("axis0.config.watchdog_timeout", self.silence_s)
         except BaseException:
             self.close()
             raise
@@ -158,7 +141,7 @@ class ODrive(Device):
         self._require_no_error()
         self._on = True
         self._tell("v 0 0 0")  # feeds the watchdog too, which is not enabled before
-        self._set(WATCHDOG, bool(self._silence_s))
+        self._set(WATCHDOG, bool(self.silence_s))
         self._tell(f"w axis0.requested_state {CLOSED_LOOP}")
         self._await(CLOSED_LOOP)
         if self._halted:
