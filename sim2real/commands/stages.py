@@ -6,6 +6,7 @@ import importlib
 import sys
 from contextlib import nullcontext
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Generic, TypeVar
 
@@ -136,9 +137,10 @@ def split_pipeline(command: str, arguments: list[str]) -> tuple[str, list[str]]:
     if arguments and arguments[0] in ("-h", "--help", "--help-all"):
         return DEMO_PIPELINE, arguments
     if not arguments or arguments[0].startswith("-"):
+        model = next((b for a, b in pairwise(arguments) if a == "--mjcf"), "MODEL")
         raise UsageError(
             f"{command} needs a pipeline before its flags. Available: {', '.join(sorted(available())) or 'none'}",
-            hint=f"sim2real {command} PIPELINE [FLAGS]; `sim2real new` makes a pipeline of a model",
+            hint=f"sim2real {command} PIPELINE [FLAGS]; `sim2real new NAME --mjcf {model}` makes a pipeline of a model",
         )
     return arguments[0], arguments[1:]
 

@@ -16,7 +16,6 @@ import numpy as np
 from sim2real import pytree
 from sim2real.artifacts.files import plain, to_json
 from sim2real.artifacts.paths import shown
-from sim2real.artifacts.run import newest
 from sim2real.artifacts.summary import ArtifactTable, Shown
 from sim2real.errors import NotInstalled, Sim2RealError, UsageError
 from sim2real.graph.episode import Episode
@@ -33,6 +32,7 @@ from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.load import AnyRobot, defaults_of, robot_of
 from sim2real.stages.session.excitation import played
 from sim2real.stages.shared.arguments import AnyRecording, config_of, open_recording, recordings_of
+from sim2real.stages.shared.find_run import newest_recording
 from sim2real.stages.shared.identification import command, side_by_side, usable
 from sim2real.stages.terminal.console import artifact_table, note, pairs, progress
 from sim2real.types import Json
@@ -320,14 +320,10 @@ def find_logs(robot: RecordedRobot, config: CheckConfig) -> dict[str, Episode]:
     paths = [Path(p) for p in config.log]
     if not paths and not config.plan:
         try:
-            paths = newest(config.runs, robot.name, "record").logs()
-        except Sim2RealError as error:
+            paths = newest_recording(robot, config.runs).logs()
+        except Sim2RealError:
             if not isinstance(robot, Robot):
-                raise UsageError(
-                    f"there is no recording of {robot.name!r} in {shown(config.runs)}, and the pipeline has no "
-                    "excitation to plan one with",
-                    hint=f"name a log with --log FILE, or `sim2real import FILE --pipeline {robot.name}`",
-                ) from error
+                raise
             note(f"no recording of {robot.name} in {shown(config.runs)}: the planned excitation is simulated")
     return {shown(p): open_recording(p, robot).episode for p in paths}
 

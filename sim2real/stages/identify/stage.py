@@ -17,7 +17,7 @@ from sim2real.artifacts.identification import (
     with_small_unit,
 )
 from sim2real.artifacts.paths import shown
-from sim2real.artifacts.run import OpenStage, StageFolder, newest, open_stage
+from sim2real.artifacts.run import OpenStage, StageFolder, open_stage
 from sim2real.errors import UsageError
 from sim2real.identification.uncertainty import noises
 from sim2real.identification.verdict import advised
@@ -29,6 +29,7 @@ from sim2real.stages.identify.judgement import judge
 from sim2real.stages.identify.progress import PARTIAL, Best, kept
 from sim2real.stages.load import AnyRobot, defaults_of, robot_of
 from sim2real.stages.shared.arguments import AnyRecording, config_of, open_recording, recordings_of
+from sim2real.stages.shared.find_run import newest_recording
 from sim2real.stages.shared.identification import command, continuing, identified_robot
 from sim2real.stages.terminal.console import artifact_table, note, progress
 
@@ -213,5 +214,5 @@ def find_logs(
     held_out = [Path(p) for p in config.hold_out]
     if config.log:
         return [Path(p) for p in config.log] + held_out, run_dir
-    recorded = newest(root, robot.name, "record", run_dir)
+    recorded = newest_recording(robot, root, run_dir)
     return [*recorded.logs(), *held_out], run_dir or recorded.run_dir

@@ -1,12 +1,18 @@
 """The run of a user's text: its path, its name, a stage folder in it, or a pipeline's newest run."""
 
+from __future__ import annotations
+
 import difflib
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from sim2real.artifacts.run import STAGES, StageFolder, attempts, finished, run_folders, stage_status, why_stale
-from sim2real.errors import UsageError
+from sim2real.artifacts.run import STAGES, StageFolder, attempts, finished, newest, run_folders, stage_status, why_stale
+from sim2real.errors import Sim2RealError, UsageError
 from sim2real.stages.load import available
 from sim2real.stages.terminal.console import note
+
+if TYPE_CHECKING:
+    from sim2real.robots.robot import RecordedRobot
 
 
 def find_run(root: Path, target: str | Path, pipeline: str | None = None) -> Path:
@@ -30,6 +36,26 @@ def find_run(root: Path, target: str | Path, pipeline: str | None = None) -> Pat
     if pipeline is None and (folders := run_folders(root, str(target))):
         return next((f for f in reversed(folders) if any(finished(f, stage) for stage in STAGES)), folders[-1])
     raise _nothing_there(root, str(target))
+
+
+def newest_recording(robot: RecordedRobot, root: Path, run_dir: Path | None = None) -> StageFolder:
+    """Return the newest finished recording of a robot, first of the given run.
+
+    Raises:
+        UsageError: When there is none, and the robot has no motors to make one with.
+        Sim2RealError: When there is none.
+    """
+    try:
+        return newest(root, robot.name, "record", run_dir)
+    except Sim2RealError as error:
+        from sim2real.robots.robot import Robot  # JAX takes 0.5 s
+
+        if isinstance(robot, Robot):
+            raise
+        raise UsageError(
+            f"there is no recording of {robot.name!r} in {root}, and the pipeline has no motors to make one with",
+            hint=f"name a log with --log FILE, or `sim2real import FILE --pipeline {robot.name}`",
+        ) from error
 
 
 def warn_of_stale(folder: StageFolder) -> StageFolder:
