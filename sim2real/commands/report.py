@@ -157,7 +157,7 @@ def compare(config: ReportConfig) -> Comparison:
         if parameters.rows:
             print(artifact_table(parameters))
             note(f"intervals that do not overlap: {', '.join(comparison.different) or 'of no parameter'}")
-    from sim2real.view.comparison import comparison_page  # imports matplotlib
+    from sim2real.view.page import comparison_page  # imports matplotlib
 
     page = comparison_page(comparison, config.out or Path(COMPARISON))
     if config.json:

@@ -15,7 +15,6 @@ from sim2real.errors import UsageError
 from sim2real.graph.node import TICKS_PER_S, BaseNode, Connection, by_name
 from sim2real.graph.schedule import topological
 from sim2real.graph.timeline import Timeline
-from sim2real.graph.times import Edge
 from sim2real.view.style import BLUE, GRID, INK, MUTED, ORANGE, new_figure, styled
 
 _BAR = 0.34
@@ -82,7 +81,12 @@ def plot_timeline(
         # Draw the messages between the drawn nodes.
         for (reader, _), edge in timeline.edges.items():
             if reader in lanes and edge.sender in lanes:
-                _draw_messages(axes, timeline, episode, (reader, edge), lanes, (begin_s, end_s))
+                read = np.flatnonzero(edge.seq_in[episode] >= 0)
+                sent, received = timeline.vertices[edge.sender].end[episode, read], edge.received[episode, read]
+                used = timeline.vertices[reader].start[episode, edge.seq_in[episode, read]]
+                near = (used >= begin_s * TICKS_PER_S) & (sent <= end_s * TICKS_PER_S)
+                times = (times[near] / TICKS_PER_S for times in (sent, received, used))
+                draw_messages(axes, (lanes[edge.sender], lanes[reader]), *times)
         axes.set_yticks(list(lanes.values()), list(lanes))
         axes.set_xlim(begin_s, end_s)
         axes.set_ylim(-0.6, len(names) - 0.4)
@@ -142,22 +146,16 @@ def _draw_connection(axes: Axes, begin: float, end: float, number: int, connecti
     axes.text(*at, ", ".join(words), ha="center", va="bottom" if ahead else "top", color=MUTED)
 
 
-def _draw_messages(
-    axes: Axes,
-    timeline: Timeline,
-    episode: int,
-    connection: tuple[str, Edge],
-    lanes: Mapping[str, float],
-    shown_s: tuple[float, float],
+def draw_messages(
+    axes: Axes, rows: tuple[float, float], sent: np.ndarray, received: np.ndarray, used: np.ndarray, color: str = ORANGE
 ) -> None:
-    reader, edge = connection
-    starts, ends = timeline.vertices[reader].start[episode], timeline.vertices[edge.sender].end[episode]
-    top, bottom = lanes[edge.sender], lanes[reader]
+    """Draw messages ``(N,)`` in a schedule: a line from sending to arrival, dotted on to the step that reads it.
+
+    Args:
+        rows: Heights of the sender and of the reader.
+    """
+    top, bottom = rows
     side = _BAR / 2 if bottom > top else -_BAR / 2
-    for m in np.flatnonzero(edge.seq_in[episode] >= 0):
-        sent, received = ends[m] / TICKS_PER_S, edge.received[episode, m] / TICKS_PER_S
-        used = starts[edge.seq_in[episode, m]] / TICKS_PER_S
-        if used < shown_s[0] or sent > shown_s[1]:
-            continue
-        axes.plot([sent, received], [top + side, bottom - side], color=ORANGE, linewidth=0.8)
-        axes.plot([received, used], [bottom - side] * 2, color=ORANGE, linewidth=0.8, linestyle=":")
+    for at, arrived, read in zip(sent, received, used, strict=True):
+        axes.plot([at, arrived], [top + side, bottom - side], color=color, linewidth=0.8)
+        axes.plot([arrived, read], [bottom - side] * 2, color=color, linewidth=0.8, linestyle=":")

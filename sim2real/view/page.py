@@ -6,8 +6,9 @@ from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from sim2real.artifacts.comparison import Comparison
 from sim2real.artifacts.run import STAGES, StageFolder, attempts, finished_stages, stage_status
-from sim2real.view.blocks import NoteBlock, PageSection
+from sim2real.view.blocks import Banner, NoteBlock, PageSection, TableBlock
 from sim2real.view.sections import SECTIONS, iterations_sections
 
 PAGE = "report.html"
@@ -43,6 +44,19 @@ def report(run_dir: Path, out: Path | None = None) -> Path:
         absent={stage: _tried(run_dir, stage) for stage in STAGES if stage not in artifacts},
         notes=_about_others(run_dir, artifacts),
     )
+
+
+def comparison_page(comparison: Comparison, path: Path) -> Path:
+    """Write the page of a comparison and return its path."""
+    different = ", ".join(comparison.different)
+    title = f"intervals that do not overlap: {different}" if different else "the intervals of all parameters overlap"
+    blocks = [
+        TableBlock.of("Verdicts, errors and scores", comparison.figures()),
+        TableBlock.of("Parameters: estimate and half-width of the 95 % interval", comparison.rows()),
+    ]
+    lead = f"{len(comparison.runs)} runs: {', '.join(run.name for run in comparison.runs)}."
+    banner = Banner("doubt" if different else "good", title)
+    return write_page(path, "comparison", [PageSection("compare", "Comparison", lead, (), blocks, banner)])
 
 
 def write_page(

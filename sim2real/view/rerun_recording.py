@@ -13,9 +13,9 @@ import numpy as np
 from sim2real.artifacts.run import finished_stages, pipeline_of
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import TICKS_PER_S, Episode
-from sim2real.view.node_looks import color_of, in_order, slowest_period_s
 from sim2real.view.rerun_content import IDLE, Curve, Tab, readable, states_of, tabs_of
 from sim2real.view.rerun_viewer import open_viewer, rerun_module
+from sim2real.view.timing import color_of, in_order, slowest_period_s
 
 TIMELINE = "time"
 """The only timeline, so that the viewer has no choice of another one."""

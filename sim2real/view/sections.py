@@ -1,6 +1,6 @@
 """The sections of a page: record, train, deploy and the iterations, each from the stage's folder."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +17,7 @@ from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run import StageFolder, finished
 from sim2real.artifacts.sensitivity import SENSITIVITY, Sensitivity
 from sim2real.artifacts.summary import words_and_unit
-from sim2real.graph.episode import Episode
 from sim2real.log.schema import unit_of
-from sim2real.types import Json
 from sim2real.view import style
 from sim2real.view.blocks import (
     Banner,
@@ -33,16 +31,14 @@ from sim2real.view.blocks import (
     Tile,
     Tone,
     about,
-    fixed,
     number,
     sentence,
 )
-from sim2real.view.delay_parts import delay_blocks
 from sim2real.view.identification import identify_section
 from sim2real.view.panels import Line, Panel, compared, over_time, with_unit
 from sim2real.view.signals import ComparedSeries, Signals, pairs_of, signals_of, simulated_beside
 from sim2real.view.style import BLUE, INK, new_figure, styled, to_svg
-from sim2real.view.timing import timing_blocks, timing_tiles
+from sim2real.view.timing import delay_blocks, is_virtual, timing_blocks, timing_tiles
 
 _MAX_LATE = 0.01
 """Share of late answers above which the page gives advice."""
@@ -75,7 +71,6 @@ def record_section(artifact: StageFolder) -> PageSection:
     blocks.append(FigureBlock(recording_svg(log, "record-signals"), caption))
     blocks += timing_blocks(log.episode, "record")
     blocks += delay_blocks(recording, None if identified is None else Identification.load(identified.folder))
-    blocks += servo_blocks([log.episode])
     steps = max((len(s) for s in log.episode.steps.values()), default=0)
     tiles = [Tile("length", f"{log.episode.duration_s:.1f} s", f"{steps} steps"), *timing_tiles([log.episode])]
     lead = "The robot under an excitation" + (", without torque." if log.dry else "; all later stages use this log.")
@@ -90,7 +85,9 @@ def record_banner(log: Signals) -> Banner:
     faults = list(log.warnings)
     late = int(end.get("late_replies") or 0) / max(1, int(end.get("transactions") or 0))
     if late > _MAX_LATE:
-        faults.append(f"{late:.1%} of the answers came so late that the time of the sample is uncertain.")
+        advice = "" if is_virtual(log.episode) else ", and set the latency timer of a USB adapter to 1 ms"
+        uncertain = f"{late:.1%} of the answers came so late that the time of the sample is uncertain"
+        faults.append(f"{uncertain}: close what else runs on this computer{advice}.")
     if faults:
         return Banner("doubt", "Incomplete" if log.warnings else "Late answers", faults)
     lost = f"; {number(end['lost_replies'])} lost answers were requested again" if "lost_replies" in end else ""
@@ -113,32 +110,6 @@ def recording_svg(log: Signals, name: str) -> str:
         label = with_unit(f"{series.source}.{series.name}", log.units, series.name)
         panels.append(Panel(label, [Line(series.t_s, series.values, commanded, "command", held=True)], zoom=zoom))
     return over_time(panels, name, f"Measured and commanded signals over {log.episode.duration_s:.1f} s")
-
-
-def servo_blocks(episodes: Sequence[Episode]) -> list[Block]:
-    """Return sentences on the answers of one session's servos; empty for a log without servos."""
-    # The count of answers covers all episodes of a session.
-    end: Mapping[str, Json] = episodes[-1].metadata.get("log", {}).get("session_end") or {}
-    items = list(_answers(end, episodes[-1].metadata.get("port") == "embedded"))
-    return [ListBlock("Servos and their measurements", items)] if items else []
-
-
-def _answers(end: Mapping[str, Json], embedded: bool) -> Iterator[str]:
-    """Yield sentences on the number of answers, and on late answers."""
-    if "late_replies" not in end or not end.get("transactions"):
-        return
-    count, late = int(end["transactions"]), int(end["late_replies"])
-    yield f"{number(count)} answers came; {number(end.get('lost_replies', 0))} were lost, and requested again."
-    count_late = f"{number(late)} answers ({late / count:.1%})" if late else "No answer"
-    advice = "" if embedded else ", and set the latency timer of a USB adapter to 1 ms"
-    advice = f": close what else runs on this computer{advice}" if late > _MAX_LATE * count else ""
-    yield f"{count_late} came so late that the sample's time is uncertain{advice}."
-    if all(isinstance(q, int | float) for q in end.get("late_s") or [None]):
-        half, most, last = (fixed(1e3 * q, 2) for q in end["late_s"])
-        yield (
-            f"Beyond the time that its bytes take, half of the answers took {half} ms or less, 99 % {most} ms or less, "
-            f"the slowest {last} ms."
-        )
 
 
 # -- train
@@ -286,7 +257,6 @@ def deploy_section(artifact: StageFolder) -> PageSection:
     # Fold the timing of all episodes but the first.
     for index, log in enumerate(logs):
         blocks += timing_blocks(log.episode, f"deploy-{index}", f" Episode {index}.", folded=index > 0)
-    blocks += servo_blocks([log.episode for log in logs])
     # The tiles have the success on the robot and in simulation.
     real, simulated = (
         [float(value) for s in scores if (value := (s or {}).get("success")) is not None]

@@ -1,23 +1,33 @@
-"""Timing of a log on a page: the schedule as a figure, and a row of numbers for each node."""
+"""Timing of a log on a page: the schedule as a figure, a row of numbers for each node, and the parts of the delay."""
 
+import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import astuple, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import is_color_like, to_hex
 from matplotlib.patches import Patch
 
-from sim2real.artifacts.timing import Timing
+from sim2real.artifacts.identification import ROUND_TRIP, Identification
+from sim2real.artifacts.recording import Recording
+from sim2real.artifacts.timing import Spread, Timing
 from sim2real.graph.episode import Episode, Steps
+from sim2real.graph.node import TICKS_PER_S
 from sim2real.log.session import is_imported
+from sim2real.robots.loop import ACTUATOR, AGENT, SENSOR
 from sim2real.types import Json
 from sim2real.view import style
-from sim2real.view.blocks import Block, FigureBlock, TableBlock, Tile
-from sim2real.view.node_looks import color_of, in_order, slowest_period_s
+from sim2real.view.blocks import MISSING, Block, FigureBlock, TableBlock, Tile, fixed
+from sim2real.view.graphs import draw_messages
 from sim2real.view.style import BLUE, MUTED, ORANGE, new_figure, styled, to_svg
 
 _PERIODS_SHOWN = 4.5
+_CHAIN = (SENSOR, AGENT, ACTUATOR)
+"""The nodes that a measurement passes on its way to a motor."""
 
 
 def timing_tiles(episodes: Sequence[Episode]) -> Iterator[Tile]:
@@ -54,38 +64,33 @@ def timing_blocks(episode: Episode, name: str, which: str = "", folded: bool = F
     if folded:
         return [table]
     caption = (
-        f"Computation of each node over time.{which} An arrow is a message, from the end of the sender's step to the "
-        "start of the reader's step."
+        f"Computation of each node over time.{which} A line is a message on its way, dotted until a step reads it."
     )
     return [FigureBlock(schedule(episode, f"{name}-schedule"), caption), table]
 
 
 def schedule(episode: Episode, name: str) -> str:
-    """Draw when nodes computed and waited, in an episode's middle and, in real time, around the latest wake-up."""
+    """Draw when nodes computed and waited: in real time around the latest wake-up, in virtual time in the middle."""
     nodes = [n for n in in_order(episode) if len(episode.steps[n])]
     length = _PERIODS_SHOWN * 1e6 * slowest_period_s(episode)
-    # Find the latest wake-up, which the lower plot shows.
     late = {n: episode.steps[n].woken - episode.steps[n].start for n in nodes}
     worst = max(nodes, key=lambda n: late[n].max())
-    moment = int(episode.steps[worst].start[late[worst].argmax()])
-    middle = int(1e6 * episode.duration_s / 2)
+    title = f"Around the latest wake-up: {worst}, {late[worst].max() / 1e3:.1f} ms"
+    begin = max(0, int(episode.steps[worst].start[late[worst].argmax()]) - int(0.4 * length))
+    if is_virtual(episode):
+        begin = int(1e6 * episode.duration_s / 2)
+        title = f"At {begin / 1e6:.1f} s"
     with styled():
-        titles = [f"At {middle / 1e6:.1f} s", f"Around the latest wake-up: {worst}, {late[worst].max() / 1e3:.1f} ms"]
-        titles = titles[:1] if is_virtual(episode) else titles
-        figure = new_figure((1.5 + 0.75 * len(nodes)) * len(titles) / 2 + 0.2, style.PHONE_IN)
-        grid = figure.subplots(len(titles), 1, sharey=True, squeeze=False)[:, 0]
-        # Draw steps as bars and messages as arrows, in the middle and around the latest wake-up.
-        begins = (middle, max(0, moment - int(0.4 * length)))
-        for axes, begin, title in zip(grid, begins, titles, strict=False):
-            for row, node in enumerate(nodes):
-                look = color_of(episode, node, BLUE)
-                _bars(axes, episode.steps[node], row, begin, begin + length, look)
-            _arrows(axes, episode, nodes, begin, begin + length)
-            axes.set(title=title, xlabel=f"time since {begin / 1e6:.3f} s [ms]", xlim=(0, length / 1e3))
-            axes.set_yticks(range(len(nodes)), nodes)
-            axes.grid(False, axis="y")
-            axes.tick_params(axis="y", length=0)
-        grid[0].set_ylim(len(nodes) - 0.5, -0.6)
+        figure = new_figure(0.9 + 0.4 * len(nodes), style.PHONE_IN)
+        axes = figure.subplots()
+        for row, node in enumerate(nodes):
+            _bars(axes, episode.steps[node], row, begin, begin + length, color_of(episode, node, BLUE))
+        _messages(axes, episode, nodes, begin, begin + length)
+        axes.set(title=title, xlabel=f"time since {begin / 1e6:.3f} s [ms]", xlim=(0, length / 1e3))
+        axes.set_yticks(range(len(nodes)), nodes)
+        axes.grid(False, axis="y")
+        axes.tick_params(axis="y", length=0)
+        axes.set_ylim(len(nodes) - 0.5, -0.6)
         own_colors = any(color_of(episode, n, BLUE) != BLUE for n in nodes)
         entries = [
             Patch(facecolor=BLUE, label="computing, or in the node's own colour" if own_colors else "computing"),
@@ -93,7 +98,7 @@ def schedule(episode: Episode, name: str) -> str:
             Patch(facecolor="none", edgecolor=MUTED, hatch="////", label="waiting for its inputs"),
         ]
         style.legend_above(figure, entries)
-        return to_svg(figure, name, "Excerpts of the schedule: when each node waited and computed, and its messages")
+        return to_svg(figure, name, "An excerpt of the schedule: when each node waited and computed, and its messages")
 
 
 def _bars(axes: Axes, steps: Steps, row: int, begin: float, end: float, color: str) -> None:
@@ -113,25 +118,99 @@ def _bars(axes: Axes, steps: Steps, row: int, begin: float, end: float, color: s
         axes.broken_barh(list(zip(first[wide], (last - first)[wide], strict=True)), (row - 0.28, 0.56), **look)
 
 
-def _arrows(axes: Axes, episode: Episode, nodes: list[str], begin: float, end: float) -> None:
-    """Draw the messages in an interval as arrows, from the sender's end to the reader's start."""
+def _messages(axes: Axes, episode: Episode, nodes: list[str], begin: float, end: float) -> None:
+    """Draw the messages between nodes in an interval [us]."""
     graph = episode.metadata.get("graph", {})
     for (node, input_name), messages in episode.messages.items():
         sender = graph.get(node, {}).get("inputs", {}).get(input_name, {}).get("from")
         if sender not in nodes or node not in nodes:
             continue
-        read = (messages.sent >= begin) & (messages.received <= end) & (messages.seq_in >= 0)
-        rows = nodes.index(sender), nodes.index(node)
-        down = 1 if rows[1] > rows[0] else -1
-        first = int(episode.metadata.get("log", {}).get("first_seq", {}).get(node, 0))
         starts = episode.steps[node].start
-        # Draw an arrow from the sender's end to the start of the step that uses the message.
-        for sent, seq_in in zip(messages.sent[read], messages.seq_in[read] - first, strict=True):
-            if not 0 <= seq_in < len(starts) or starts[seq_in] > end:
-                continue
-            axes.annotate(
-                "",
-                ((starts[seq_in] - begin) / 1e3, rows[1] - 0.28 * down),
-                ((sent - begin) / 1e3, rows[0] + 0.28 * down),
-                arrowprops={"arrowstyle": "->", "color": MUTED, "lw": 0.8, "shrinkA": 0, "shrinkB": 0},
-            )
+        seq_in = messages.seq_in - int(episode.metadata.get("log", {}).get("first_seq", {}).get(node, 0))
+        read = (messages.sent >= begin) & (messages.seq_in >= 0) & (seq_in >= 0) & (seq_in < len(starts))
+        used = starts[np.where(read, seq_in, 0)]
+        read &= used <= end
+        times = ((values[read] - begin) / 1e3 for values in (messages.sent, messages.received, used))
+        draw_messages(axes, (nodes.index(sender), nodes.index(node)), *times, color=MUTED)
+
+
+def delay_blocks(recording: Recording, identification: Identification | None) -> list[Block]:
+    """Return the table of the delay's parts; nothing of an imported log, whose steps have stamps alone.
+
+    Args:
+        identification: Of this robot, with the device's share; None: the share is unknown.
+    """
+    episode = recording.episode
+    if is_imported(episode) or not set(_CHAIN) <= set(episode.steps):
+        return []
+    rows, sum_s = [], 0.0
+    for name, where, times_s, counted in parts_of(recording):
+        spread = Spread.of(times_s)
+        sum_s += (spread.p50 or 0.0) if counted else 0.0
+        cells = [MISSING if s is None else fixed(1e3 * s, 2) for s in astuple(spread)]
+        rows.append([name, where if counted else f"({where})", *cells])
+    # No clock of this computer measures the rest: from a motion to its sample, and from a command to the motion.
+    rows_of = identification.parameters if identification else ()
+    whole = "sum of the medians, without the device and parts in ()"
+    if (device := next((p for p in rows_of if p.name == ROUND_TRIP), None)) is not None:
+        rows.append([f"{device.about}, from the motion", "device", fixed(1e3 * device.estimate, 2), MISSING, MISSING])
+        sum_s, whole = sum_s + device.estimate, "sum of the medians, without parts in ()"
+    rows.append([whole, "", fixed(1e3 * sum_s, 2), MISSING, MISSING])
+    caption = "Delay from a motion to the motion that answers it [ms]"
+    return [TableBlock(caption, ("part", "where", "p50", "p99", "max"), rows, text_columns=(1,))]
+
+
+def parts_of(recording: Recording) -> Iterator[tuple[str, str, np.ndarray, bool]]:
+    """Yield the parts that clocks of this computer measure: name, ``host`` or ``bus``, times ``(N,)`` [s].
+
+    The fourth is whether a part counts in the sum: the sensor's request on the bus comes before the sample.
+    """
+    timing, steps = recording.timing, recording.episode.steps[SENSOR]
+    yield f"{SENSOR}, from the sample to its message", "host", (steps.end - steps.begun) / TICKS_PER_S, True
+    if (bus := timing.bus_s.get(SENSOR)) is not None and bus.size:
+        yield f"{SENSOR} on the bus, question and answer", "bus", bus, False
+    for before, name in pairwise(_CHAIN):
+        if (under_way := timing.transport_s.get(f"{name}/{before}")) is not None:
+            yield f"message from {before} to {name}", "host", under_way, True
+        whole, bus = timing.steps_s[name], timing.bus_s.get(name)
+        if bus is None or not bus.size:
+            yield f"{name} wakes and computes", "host", whole, True
+        elif bus.size == whole.size:
+            yield f"{name} wakes and computes", "host", whole - bus, True
+            yield f"{name} on the bus", "bus", bus, True
+        else:
+            yield f"{name}, its transactions included", "bus", whole, True
+
+
+def in_order(episode: Episode) -> list[str]:
+    """Return the nodes' names: first those with an ``order``, then the others, senders before readers if possible."""
+    senders: Mapping[str, set[str]] = {
+        n: {i["from"] for i in node.get("inputs", {}).values()} for n, node in episode.metadata.get("graph", {}).items()
+    }
+    order: list[str] = []
+    remaining = list(episode.steps)
+    while remaining:
+        ready = [n for n in remaining if not (senders.get(n, set()) & set(remaining) - {n})] or remaining
+        order.append(ready[0])
+        remaining.remove(ready[0])
+    orders = {n: node.get("order") for n, node in episode.metadata.get("graph", {}).items()}
+    place = {n: orders[n] if isinstance(orders.get(n), int) else math.inf for n in order}
+    return sorted(order, key=lambda n: place[n])  # a stable sort
+
+
+def color_of(episode: Episode, node: str, default: str) -> str:
+    """Return a node's colour as ``#rrggbb``.
+
+    Args:
+        default: Returned if the node has no valid colour.
+    """
+    color = episode.metadata.get("graph", {}).get(node, {}).get("color")
+    if not isinstance(color, str) or re.fullmatch("#[0-9a-f]{6}", color):
+        return color or default
+    return to_hex(color) if is_color_like(color) else default
+
+
+def slowest_period_s(episode: Episode) -> float:
+    """Return the longest of the nodes' median periods [s]."""
+    periods = [float(np.median(np.diff(s.start))) for s in episode.steps.values() if len(s) > 1]
+    return max(periods, default=1e6 * episode.duration_s) / 1e6

@@ -20,7 +20,7 @@ from sim2real.robots.nodes import Excitation
 from sim2real.stages.load import load_module, load_robot
 from sim2real.stages.session import episode
 from sim2real.stages.session.excitation import played
-from sim2real.view.delay_parts import parts_of
+from sim2real.view.timing import parts_of
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import pytest
 from sim2real.artifacts.identification import Estimate, Identification, Judgement
 from sim2real.artifacts.recording import Recording
 from sim2real.graph.episode import Episode, Messages, Steps
-from sim2real.view.delay_parts import delay_blocks, parts_of
+from sim2real.view.timing import delay_blocks, parts_of
 
 COUNT = 50
 

@@ -90,7 +90,7 @@ def test_a_figure_is_one_well_formed_element_with_a_label(picture):
     root = ET.fromstring(picture)
     assert root.tag == f"{SVG}svg"
     assert root.get("role") == "img"
-    assert root.get("aria-label") == "Excerpts of the schedule: when each node waited and computed, and its messages"
+    assert root.get("aria-label") == "An excerpt of the schedule: when each node waited and computed, and its messages"
     assert "<metadata" not in picture
 
 

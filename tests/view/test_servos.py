@@ -1,21 +1,18 @@
-"""What the page says of the servos, in words."""
+"""What the page says of the servos' answers, in words."""
 
 from types import SimpleNamespace
 
-from sim2real.view.sections import servo_blocks
+from sim2real.view.sections import record_banner
 
 
-def episode(end, dry=False, port="/dev/ttyUSB0"):
-    return SimpleNamespace(metadata={"dry_run": dry, "port": port, "log": {"session_end": end}})
-
-
-def test_a_log_that_tells_nothing_of_servos_has_no_block():
-    assert servo_blocks([episode(None), episode({"timing": {}})]) == []
-    assert servo_blocks([episode({"transactions": 0, "late_replies": 0, "late_s": [None] * 3})]) == []
+def verdict(port, late):
+    end = {"transactions": 100, "late_replies": late, "lost_replies": 0}
+    episode = SimpleNamespace(metadata={"port": port, "log": {"session_end": end}}, duration_s=1.0)
+    return str(record_banner(SimpleNamespace(episode=episode, dry=False, warnings=())))
 
 
 def test_late_answers_of_an_emulated_robot_are_not_those_of_an_adapter():
-    late = {"transactions": 100, "late_replies": 30, "late_s": [0.0, 0.01, 0.02]}
-    advised = {port: str(servo_blocks([episode(late, port=port)])[0]) for port in ("/dev/ttyUSB0", "embedded")}
-    assert ["latency timer" in text for text in advised.values()] == [True, False]
-    assert all("close what else runs" in text for text in advised.values())
+    assert "close what else runs" not in verdict("/dev/ttyUSB0", 0)
+    advised = [verdict(port, 30) for port in ("/dev/ttyUSB0", "embedded")]
+    assert ["latency timer" in text for text in advised] == [True, False]
+    assert all("close what else runs" in text for text in advised)
