@@ -101,7 +101,7 @@ def hints_of(config: ImportConfig) -> ImportHints:
     robot: Any = load_robot(config.pipeline)
     if isinstance(robot, MjcfRobot):
         return hints_of_model(robot.config.model, config.pipeline, robot.config.joints, config.rate_hz, **more)
-    joints = tuple(getattr(getattr(robot, "sensor", None), "joints", ()) or (c.label for c in robot.channels))
+    joints = tuple(c.label for c in robot.sensor.channels)
     return ImportHints(config.pipeline, config.rate_hz, config.joints or joints, **more)
 
 
