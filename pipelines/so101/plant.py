@@ -49,7 +49,6 @@ class SO101Plant(ServoPlant):
         gain: Factor on the servos' gain.
         friction: Factor on dry friction.
         damping: Factor on what brakes driven servos.
-        hand: See ``ServoPlant``.
     """
 
     def __init__(
@@ -60,7 +59,6 @@ class SO101Plant(ServoPlant):
         friction: float = 1.0,
         damping: float = 1.0,
         carried_kg: float = 0.0,
-        hand: str | None = None,
     ) -> None:
         truth = {
             "gain": gain * _GAIN,
@@ -88,6 +86,5 @@ class SO101Plant(ServoPlant):
             start=start,
             carried_kg=carried_kg,
             contact=True,
-            hand=hand,
             step_s=step_s,
         )

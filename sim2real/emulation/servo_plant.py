@@ -14,7 +14,6 @@ from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.dynamixel import RAD_PER_COUNT
 
 mj: Any = mujoco
-_HAND_NM_RAD, _HAND_DAMPING, _HAND_MOST_NM = 12.0, 0.5, 4.0  # assumed: a person's hand [N m/rad, N m s/rad, N m]
 Each = float | Sequence[float]
 """A number for all joints, or one for each."""
 
@@ -63,8 +62,6 @@ class ServoPlant:
         start: Joint angles at the beginning [rad]; default: 0.
         carried_kg: Mass at the site ``tip`` [kg].
         contact: Whether bodies touch.
-        hand: File (npz) of a person's motion, ``t_s`` ``(N,)`` [s] and ``position`` ``(N, joints)`` [rad]: a hand pulls
-            each joint without torque towards it, as a spring with a damper; None: there is no hand.
         step_s: MuJoCo's time step [s].
 
     Raises:
@@ -85,7 +82,6 @@ class ServoPlant:
         start: Sequence[float] = (),
         carried_kg: float = 0.0,
         contact: bool = False,
-        hand: str | None = None,
         step_s: float = 0.0005,
     ) -> None:
         self.joints, self.servo_ids, self._names, self._carried_kg = tuple(joints), tuple(servo_ids), names, carried_kg
@@ -97,7 +93,6 @@ class ServoPlant:
         self._gears = tuple(gears) or (1.0,) * n
         self._count_rad = [RAD_PER_COUNT / gear for gear in self._gears]
         self._zero_rad = [count * RAD_PER_COUNT for count in zero_counts or (2048,) * n]
-        self._hand = None if hand is None else dict(np.load(hand))
         self.model = self._compiled(mjcf, step_s, contact)
         self.data = mj.MjData(self.model)
         places = [self.model.joint(name) for name in self.joints]
@@ -116,12 +111,17 @@ class ServoPlant:
         for _ in range(round((t_s - data.time) / step_s)):
             angles, speeds = self._qpos[self._at].tolist(), self._qvel[self._dofs].tolist()
             self._torques = [self._torque(i, angle, step_s) for i, angle in enumerate(angles)]
-            self._applied[self._dofs] = self._torques if self._hand is None else self._with_hand(angles, speeds)
+            self._applied[self._dofs] = self.forces(angles, speeds)
             self._friction[self._dofs] = [
                 level + more * math.exp(-abs(speed) / width)
                 for level, more, speed, width in zip(self._at_speed, self._static, speeds, self._widths, strict=True)
             ]
             mj.mj_step(model, data)
+
+    def forces(self, angles: list[float], speeds: list[float]) -> list[float]:
+        """Return the torques on the joints [N m] at angles and speeds: here those of the motors alone."""
+        del angles, speeds
+        return self._torques
 
     def command(self, servo_id: int, mode: int, goal: float) -> None:
         """Set a servo's goal: rad from the encoder's count 0 (position), or the share of the supply voltage (PWM)."""
@@ -193,15 +193,6 @@ class ServoPlant:
         error = (round(self._reference[i] / count_rad) - round(angle / count_rad)) * count_rad + self._offset[i]
         torque = self._gain[i] * self._p_gain[i] / self._nominal * error
         return min(max(torque, -self._limit[i]), self._limit[i])
-
-    def _with_hand(self, angles: list[float], speeds: list[float]) -> list[float]:
-        """Return the torques on the joints: of the motors, and of the hand on joints without a motor's torque [N m]."""
-        hand, torques = self._hand or {}, list(self._torques)
-        for i in (i for i in range(len(torques)) if not self._is_on(i)):
-            there = float(np.interp(self.data.time, hand["t_s"], hand["position"][:, i]))
-            pull = _HAND_NM_RAD * (there - angles[i]) - _HAND_DAMPING * speeds[i]
-            torques[i] += min(max(pull, -_HAND_MOST_NM), _HAND_MOST_NM)
-        return torques
 
     def _compiled(self, mjcf: str | Path, step_s: float, contact: bool) -> Any:
         """Return the model: friction constraints as stiff as the solver allows; with the defaults, joints creep."""

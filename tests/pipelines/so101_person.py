@@ -14,8 +14,26 @@ STOPS_RAD = (1.92, 1.745, 1.69, 1.658, 2.7, 0.96)
 _START, _NUDGE_RAD, _PUSH_RAD = (0.0, -1.74, 1.68, -1.4, 0.0, -0.8), 0.45, 0.15
 
 
+class GuidedArm(load_module("so101", "plant").SO101Plant):
+    """An arm whose joints a hand pulls while their motors are off: a spring with a damper, to a motion in a file (npz).
+
+    The file has ``t_s`` ``(N,)`` [s] and ``position`` ``(N, joints)`` [rad].
+    """
+
+    def __init__(self, hand, **settings):
+        self.hand = dict(np.load(hand))
+        super().__init__(**settings)
+
+    def forces(self, angles, speeds):
+        torques = list(super().forces(angles, speeds))
+        for i in (i for i in range(len(torques)) if not self._is_on(i)):
+            there = float(np.interp(self.data.time, self.hand["t_s"], self.hand["position"][:, i]))
+            torques[i] += np.clip(12.0 * (there - angles[i]) - 0.5 * speeds[i], -4.0, 4.0)
+        return torques
+
+
 def write_motion(path: Path, begin_s: float = 3.0, speed_rad_s: float = 1.5) -> float:
-    """Write the motion for the argument ``hand`` of `SO101Plant`; return its end [s].
+    """Write the motion for a `GuidedArm`; return its end [s].
 
     From where it was put away the arm is lifted to its middle pose, each joint is nudged, then moved to both stops.
 

@@ -24,7 +24,7 @@ def arm(tmp_path, monkeypatch):
     embedded = load_module(SO101.name, "robot").embedded()
     monkeypatch.setenv("SO101_CALIBRATION", str(SO101.folder / "calibration.json"))
     monkeypatch.chdir(tmp_path)
-    with VirtualRobot(embedded.plant(hand=str(hand)), embedded.emulator, tmp_path / "truth.bin") as robot:
+    with VirtualRobot(so101_person.GuidedArm(hand), embedded.emulator, tmp_path / "truth.bin") as robot:
         yield robot
 
 

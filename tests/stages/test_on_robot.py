@@ -8,6 +8,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+import so101_person
 from live_robots import assert_torque_ends_off, make_bundle, manifest_of
 
 import sim2real
@@ -167,7 +168,7 @@ def test_a_recording_by_hand_has_no_command_and_no_torque(tmp_path):
     middle = (np.array(robot.drive.servos.low) + np.array(robot.drive.servos.high)) / 2
     pose = np.vstack([start, middle + 0.3 * np.sin(2 * np.pi * 0.2 * t_s[:, None] + np.arange(6))])
     np.savez(tmp_path / "hand.npz", t_s=np.concatenate([[0.0], 2.0 + t_s]), position=pose)
-    changed = replace(embedded, plant=partial(embedded.plant, hand=str(tmp_path / "hand.npz")))
+    changed = replace(embedded, plant=partial(so101_person.GuidedArm, tmp_path / "hand.npz"))
     arm = type(robot)()
     settings = load_module(robot.name, "robot").calibrated
     arm.drive = type(robot.drive)(robot.drive.servos, embedded=lambda: changed, settings=settings)
