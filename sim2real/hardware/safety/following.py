@@ -36,6 +36,125 @@ class _Sent:
     end_s: float = np.inf
 
 
+@dataclass
+class _Sample:
+    """A measurement; arrays ``(n,)``."""
+
+    position_rad: np.ndarray
+    velocity_rad_s: np.ndarray
+    load: np.ndarray
+    t_s: float
+    elapsed_s: float
+    unsure_s: float
+
+
+class _Goals:
+    """The distance of each joint from where its goals put it [rad]."""
+
+    def __init__(self, following: Following, start: np.ndarray) -> None:
+        self._following = following
+        both = np.broadcast_to(np.asarray(following.speed_rad_s, np.float64), len(start))
+        self._speeds = following.speeds or (lambda _: (both, both))
+        self._low = self._high = self._position = start
+        self._place = start, start
+
+    def off(self, commands: Sequence[_Sent], now: _Sample) -> np.ndarray:
+        goals, position_rad = np.array([sent.command for sent in commands]), now.position_rad
+        # A joint that is on its way to its goals goes on from where it was measured last.
+        downwards, upwards = self._speeds(self._position)
+        self._low = np.minimum(goals.min(axis=0), np.maximum(self._low, self._position) + upwards * now.elapsed_s)
+        self._high = np.maximum(goals.max(axis=0), np.minimum(self._high, self._position) - downwards * now.elapsed_s)
+        self._position = position_rad
+        low, high = self._low, self._high
+        if self._following.weight is not None:
+            down, up = self._following.weight(position_rad)
+            low, high = low + np.minimum(down, 0.0), high + np.maximum(up, 0.0)
+        self._place = low, high
+        return np.maximum(np.maximum(low - position_rad, position_rad - high), 0.0)
+
+    def fault(self, i: int, now: _Sample, off: float, limit: float) -> str:
+        low, high = self._place[0][i], self._place[1][i]
+        place = f"{low:.3g} rad" if high - low < 5e-3 else f"{low:.3g} to {high:.3g} rad"
+        return (
+            f"is at {now.position_rad[i]:.3g} rad, its commands put it at {place}: it is {off:.2g} rad away, "
+            f"{limit:.2g} rad are allowed"
+        )
+
+
+class _Torques:
+    """By how much the load of each motor is weaker than its law, on average [N m]."""
+
+    def __init__(self, following: Following, start: np.ndarray) -> None:
+        self._following = following
+        self._weak, self._law = np.zeros(len(start)), np.zeros(len(start))
+
+    def off(self, commands: Sequence[_Sent], now: _Sample) -> np.ndarray:
+        # The robot obeys the last command that was sent, or one that is being sent.
+        after = [*commands[1:], None]
+        laws = [c.command for c, then in zip(commands, after, strict=True) if then is None or then.end_s > now.t_s]
+        most = np.asarray(self._following.most_nm, np.float64)
+        q, dq, kp, kd, tau = np.moveaxis(np.array(laws), -1, 0)
+        torques = np.clip(tau + kp * (q - now.position_rad) + kd * (dq - now.velocity_rad_s), -most, most)
+        missing = np.abs(torques) - np.sign(torques) * now.load
+        share = min(1.0, now.elapsed_s / self._following.response_s)
+        self._law = self._law + share * (torques[-1] - self._law)
+        self._weak = self._weak + share * (missing.min(axis=0) - self._weak)
+        return np.maximum(self._weak, 0.0)
+
+    def fault(self, i: int, now: _Sample, off: float, limit: float) -> str:
+        return (
+            f"pushes with {now.load[i]:.2g} N m, its command is {self._law[i]:.2g} N m: {off:.2g} N m are missing, "
+            f"{limit:.2g} N m are allowed"
+        )
+
+
+class _Pushes:
+    """Which share of the acceleration by its commands each joint lacks."""
+
+    def __init__(self, following: Following, start: np.ndarray) -> None:
+        self._following, self._none = following, np.zeros(len(start))
+        self._moved: list[tuple[float, np.ndarray, np.ndarray]] = []
+        self._velocity: np.ndarray | None = None
+        self._unsure_s = 0.0
+
+    def off(self, commands: Sequence[_Sent], now: _Sample) -> np.ndarray:
+        before, self._velocity = self._velocity, now.velocity_rad_s
+        unsure_s, self._unsure_s = max(now.unsure_s, self._unsure_s), now.unsure_s
+        if before is not None and 0.0 < now.elapsed_s <= _LONGEST_S:
+            self._compare(commands, now, before, unsure_s)
+        while self._moved and self._moved[0][0] < now.t_s - self._following.response_s:
+            self._moved.pop(0)
+        squares = np.sum([self._none, *(squared for _, squared, _ in self._moved)], axis=0)
+        products = np.sum([self._none, *(product for _, _, product in self._moved)], axis=0)
+        return np.where(squares > _ENOUGH, 1.0 - products / np.maximum(squares, _ENOUGH), 0.0)
+
+    def _compare(self, commands: Sequence[_Sent], now: _Sample, before: np.ndarray, unsure_s: float) -> None:
+        """Compare the change of speed since the last measurement with that by the commands, if times are certain."""
+        following, elapsed_s = self._following, now.elapsed_s
+        assert following.push is not None
+        # The commands that acted since then, on average.
+        ends_s = now.t_s - following.delay_s - elapsed_s * np.linspace(1.0, 0.0, _PARTS, endpoint=False)
+        begins_s = np.array([sent.begin_s for sent in commands])
+        places = np.maximum(np.searchsorted(begins_s, ends_s, "right") - 1, 0)
+        for i in np.unique(places).tolist():
+            sent = commands[i]
+            if sent.end_s > ends_s[0]:
+                unsure_s = max(unsure_s, min(sent.end_s, now.t_s) - sent.begin_s)
+        if unsure_s > _UNSURE * elapsed_s:
+            return
+        acted = np.array([commands[i].command for i in places]).mean(axis=0)
+        speed = 0.5 * (now.velocity_rad_s + before)
+        free, pushed, friction = following.push(now.position_rad - 0.5 * elapsed_s * speed, speed, acted)
+        # A joint that is slow may be held by its friction, unless it is pushed much harder.
+        moves = (np.abs(speed) > _SLOW_RAD_S) | (np.abs(free + pushed) > 3.0 * friction)
+        by_command = np.where(moves, elapsed_s * pushed, 0.0)
+        answer = now.velocity_rad_s - before - elapsed_s * free
+        self._moved.append((now.t_s, by_command**2, by_command * answer))
+
+    def fault(self, i: int, now: _Sample, off: float, limit: float) -> str:
+        return f"moves without {off:.0%} of its commands' push, {limit:.0%} are allowed"
+
+
 class FollowingCheck:
     """Compares measurements with commands; see `Following`. Both may come from different threads.
 
@@ -51,18 +170,12 @@ class FollowingCheck:
     def __init__(self, following: Following, start: np.ndarray, t_s: float, name: Callable[[int], str]) -> None:
         self._following, self._name, n = following, name, len(start)
         self._limit = np.broadcast_to(np.asarray(following.limit, np.float64), n)
-        both = np.broadcast_to(np.asarray(following.speed_rad_s, np.float64), n)
-        self._speeds = following.speeds or (lambda _: (both, both))
+        first = np.array(start, np.float64)
+        kind = _Pushes if following.push is not None else _Goals if following.most_nm is None else _Torques
+        self._kind = kind(following, first)
         self._lock = threading.Lock()
-        self._commands = [_Sent(np.array(start, np.float64), t_s, t_s)]
-        self._low = self._high = self._commands[0].command
-        self._place = self._low, self._high
-        self._position = np.array(self._low if following.most_nm is None else self._low[:, 0])
+        self._commands = [_Sent(first, t_s, t_s)]
         self._t_s = t_s
-        self._weak, self._law = np.zeros(n), np.zeros(n)
-        self._moved: list[tuple[float, np.ndarray, np.ndarray]] = []
-        self._velocity: np.ndarray | None = None
-        self._unsure_s = 0.0
         # Since when each joint is beyond its limit, and for how many samples.
         self._since_s, self._count = np.zeros(n), np.zeros(n, np.int64)
 
@@ -94,110 +207,19 @@ class FollowingCheck:
             while len(commands) > 1 and commands[1].end_s <= t_s - self._following.response_s:
                 commands.pop(0)
             recent = list(commands)
-        elapsed_s, self._t_s = max(0.0, t_s - self._t_s), t_s
-        if self._following.push is not None:
-            off = self._missing_push(recent, position_rad, velocity_rad_s, elapsed_s, unsure_s)
-        elif self._following.most_nm is None:
-            goals = np.array([sent.command for sent in recent])
-            off = self._distance(goals, position_rad, elapsed_s)
-        else:
-            # The robot obeys the last command that was sent, or one that is being sent.
-            obeyed = [
-                sent.command
-                for sent, then in zip(recent, [*recent[1:], None], strict=True)
-                if then is None or then.end_s > t_s
-            ]
-            off = self._weakness(obeyed, position_rad, velocity_rad_s, load, elapsed_s)
+        now = _Sample(position_rad, velocity_rad_s, load, t_s, max(0.0, t_s - self._t_s), unsure_s)
+        self._t_s = t_s
+        off = self._kind.off(recent, now)
         # A joint must be beyond its limit for a while: single readings may be wrong.
         beyond = off > self._limit
         self._since_s = np.where(beyond & (self._count == 0), t_s, self._since_s)
         self._count = np.where(beyond, self._count + 1, 0)
         lasting = beyond & (self._count >= _SAMPLES) & (t_s - self._since_s >= _BEYOND_S)
         if lasting.any():
-            raise self._stop(int(np.argmax(np.where(lasting, off - self._limit, -np.inf))), position_rad, load, off)
-
-    def _distance(self, goals: np.ndarray, position_rad: np.ndarray, elapsed_s: float) -> np.ndarray:
-        """Return the distance of each joint from where its goals put it [rad]."""
-        # A joint that is on its way to its goals goes on from where it was measured last.
-        downwards, upwards = self._speeds(self._position)
-        self._low = np.minimum(goals.min(axis=0), np.maximum(self._low, self._position) + upwards * elapsed_s)
-        self._high = np.maximum(goals.max(axis=0), np.minimum(self._high, self._position) - downwards * elapsed_s)
-        self._position = position_rad
-        low, high = self._low, self._high
-        if self._following.weight is not None:
-            down, up = self._following.weight(position_rad)
-            low, high = low + np.minimum(down, 0.0), high + np.maximum(up, 0.0)
-        self._place = low, high
-        return np.maximum(np.maximum(low - position_rad, position_rad - high), 0.0)
-
-    def _weakness(
-        self,
-        laws: Sequence[np.ndarray],
-        position_rad: np.ndarray,
-        velocity_rad_s: np.ndarray,
-        load: np.ndarray,
-        elapsed_s: float,
-    ) -> np.ndarray:
-        """Return by how much the load of each motor is weaker than its law, on average [N m]."""
-        most = np.asarray(self._following.most_nm, np.float64)
-        q, dq, kp, kd, tau = np.moveaxis(np.array(laws), -1, 0)
-        torques = np.clip(tau + kp * (q - position_rad) + kd * (dq - velocity_rad_s), -most, most)
-        missing = np.abs(torques) - np.sign(torques) * load
-        share = min(1.0, elapsed_s / self._following.response_s)
-        self._law = self._law + share * (torques[-1] - self._law)
-        self._weak = self._weak + share * (missing.min(axis=0) - self._weak)
-        return np.maximum(self._weak, 0.0)
-
-    def _missing_push(
-        self,
-        commands: Sequence[_Sent],
-        position_rad: np.ndarray,
-        velocity_rad_s: np.ndarray,
-        elapsed_s: float,
-        unsure_s: float,
-    ) -> np.ndarray:
-        """Return which share of the acceleration by its commands each joint lacks."""
-        push, before, self._velocity = self._following.push, self._velocity, velocity_rad_s
-        unsure_s, self._unsure_s = max(unsure_s, self._unsure_s), unsure_s
-        if push is not None and before is not None and 0.0 < elapsed_s <= _LONGEST_S:
-            # The commands that acted since the last measurement, on average; unless their times are uncertain.
-            ends_s = self._t_s - self._following.delay_s - elapsed_s * np.linspace(1.0, 0.0, _PARTS, endpoint=False)
-            begins_s = np.array([sent.begin_s for sent in commands])
-            places = np.maximum(np.searchsorted(begins_s, ends_s, "right") - 1, 0)
-            for i in np.unique(places).tolist():
-                sent = commands[i]
-                if sent.end_s > ends_s[0]:
-                    unsure_s = max(unsure_s, min(sent.end_s, self._t_s) - sent.begin_s)
-            if unsure_s <= _UNSURE * elapsed_s:
-                acted = np.array([commands[i].command for i in places]).mean(axis=0)
-                speed = 0.5 * (velocity_rad_s + before)
-                free, pushed, friction = push(position_rad - 0.5 * elapsed_s * speed, speed, acted)
-                # A joint that is slow may be held by its friction, unless it is pushed much harder.
-                moves = (np.abs(speed) > _SLOW_RAD_S) | (np.abs(free + pushed) > 3.0 * friction)
-                by_command = np.where(moves, elapsed_s * pushed, 0.0)
-                answer = velocity_rad_s - before - elapsed_s * free
-                self._moved.append((self._t_s, by_command**2, by_command * answer))
-        while self._moved and self._moved[0][0] < self._t_s - self._following.response_s:
-            self._moved.pop(0)
-        squares = np.sum([np.zeros(len(position_rad)), *(squared for _, squared, _ in self._moved)], axis=0)
-        products = np.sum([np.zeros(len(position_rad)), *(product for _, _, product in self._moved)], axis=0)
-        return np.where(squares > _ENOUGH, 1.0 - products / np.maximum(squares, _ENOUGH), 0.0)
-
-    def _stop(self, joint: int, position_rad: np.ndarray, load: np.ndarray, off: np.ndarray) -> SafetyStop:
-        name, limit, source = self._name(joint), self._limit[joint], self._following.source
-        if self._following.push is not None:
-            fault = f"{name} moves without {off[joint]:.0%} of its commands' push, {limit:.0%} are allowed ({source})"
-        elif self._following.most_nm is None:
-            low, high = self._place[0][joint], self._place[1][joint]
-            place = f"{low:.3g} rad" if high - low < 5e-3 else f"{low:.3g} to {high:.3g} rad"
-            fault = (
-                f"{name} is at {position_rad[joint]:.3g} rad, its commands put it at {place}: it is "
-                f"{off[joint]:.2g} rad away, {limit:.2g} rad are allowed ({source})"
+            i = int(np.argmax(np.where(lasting, off - self._limit, -np.inf)))
+            fault = self._kind.fault(i, now, off[i], self._limit[i])
+            cause = "has its motor let go, is it blocked, does its belt slip, or is its encoder stuck?"
+            raise SafetyStop(
+                f"{self._name(i)} {fault} ({self._following.source})",
+                hint=f"{cause} following_rad sets the limit",
             )
-        else:
-            fault = (
-                f"{name} pushes with {load[joint]:.2g} N m, its command is {self._law[joint]:.2g} N m: "
-                f"{off[joint]:.2g} N m are missing, {limit:.2g} N m are allowed ({source})"
-            )
-        cause = "has its motor let go, is it blocked, does its belt slip, or is its encoder stuck?"
-        return SafetyStop(fault, hint=f"{cause} following_rad sets the limit")
