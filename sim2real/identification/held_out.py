@@ -258,7 +258,7 @@ def predicted(
     if free_run_s:
         free, run_s = _free(problem, parts, stacked, settle_s, free_run_s)
     rows = zip(parts, values, shares, ahead, free, strict=True)
-    return [HeldOutPart(part.name, *row, run_s=run_s) for part, *row in rows]
+    return [HeldOutPart(part.name, v, share, a, f, run_s) for part, v, share, a, f in rows]
 
 
 def _ahead(

@@ -142,7 +142,7 @@ def turned_gravity(problem: Problem, values: Mapping[str, float]) -> tuple[float
         values: The estimates without it.
     """
     table = problem.table
-    estimate = table.encode({p.name: p.without for p in table} | values)
+    estimate = table.encode({**{p.name: p.without for p in table}, **values})
     columns = np.array([c.term == TILT for c in table.columns])
     # Nothing is searched for unless a small turn would help, by linear algebra.
     if not _promises(problem.linearise(estimate), columns):
