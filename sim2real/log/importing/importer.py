@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
@@ -15,7 +14,7 @@ from sim2real.errors import OK, UsageError
 from sim2real.graph.episode import Episode, StepRecord, Steps
 from sim2real.installation import version
 from sim2real.log.importing import checks
-from sim2real.log.importing.mapping import STAMP_UNITS, FieldMapping, ImportMapping, NodeMapping, in_si, load_mapping
+from sim2real.log.importing.mapping import STAMP_UNITS, ImportMapping, NodeMapping, in_si, load_mapping
 from sim2real.log.importing.names import meaning
 from sim2real.log.importing.readers import Table, open_tables
 from sim2real.log.writer import SessionFile
@@ -29,29 +28,6 @@ _OWN_START = 1_000_000
 _MOST_LACKING = 0.05
 """A field of a node may lack numbers in this share of the samples in which the node's first field has one."""
 _MOST_REPEATED = 0.1
-
-
-@dataclass
-class _Stream:
-    """The samples of one node, before and after a selection.
-
-    Attributes:
-        fields: Field -> values in the log's unit, shape ``(N, ...)``.
-        stamps: Shape ``(N,)``, as recorded; None without any.
-        rows: The numbers of the selected samples in the file.
-        turning: Fields with angles that jumped at the end of a turn.
-        dropped: Reason -> number of samples that were left out.
-    """
-
-    fields: dict[str, np.ndarray]
-    stamps: np.ndarray | None
-    rows: np.ndarray
-    turning: set[str]
-    dropped: Counter[str]
-
-    def keep(self, good: np.ndarray, reason: str) -> None:
-        self.dropped[reason] += int((~good).sum())
-        self.rows = self.rows[good]
 
 
 def import_file(
@@ -86,18 +62,15 @@ def import_file(
 @np.errstate(over="ignore", invalid="ignore")  # damaged files hold numbers of any size
 def import_table(table: Table, mapping: ImportMapping, samples: slice | None = None) -> Episode:
     """Return a table as an episode; see ``import_file``."""
-    streams = {name: _stream(table, name, node) for name, node in mapping.nodes.items()}
-    first = _cut(table, streams, samples)
-    ticks = {}
-    for name, node in mapping.nodes.items():
-        _select(table, name, node, streams[name])
-        ticks[name] = _ticks(table, name, node, streams[name])
-    outputs = {
-        name: {f: _samples(table, name, f, streams[name]) for f in node.fields} for name, node in mapping.nodes.items()
-    }
-    _align_turns(mapping, streams, outputs, ticks)
+    nodes = {name: _Node(table, name, node) for name, node in mapping.nodes.items()}
+    first = 0 if samples is None else _cut(table, nodes, samples)
+    for node in nodes.values():
+        node.select()
+    ticks = {name: node.ticks() for name, node in nodes.items()}
+    outputs = {name: node.outputs() for name, node in nodes.items()}
+    _align_turns(nodes, outputs, ticks)
     # Move time 0 to the file's zero or the first sample.
-    recorded = [name for name, own in streams.items() if own.stamps is not None]
+    recorded = [name for name, node in nodes.items() if node.stamps is not None]
     begin = min((int(ticks[name][0]) for name in recorded), default=0)
     zero = 0 if 0 <= begin <= _OWN_START and not first else begin
     for name in recorded:
@@ -110,8 +83,8 @@ def import_table(table: Table, mapping: ImportMapping, samples: slice | None = N
         **({"notes": list(table.notes)} if table.notes else {}),
         "first_sample": first,
         "time_zero_us": zero,
-        "dropped": {name: {p: n for p, n in own.dropped.items() if n} for name, own in streams.items()},
-        "turns": [f"{name}.{field}" for name, own in streams.items() for field in sorted(own.turning)],
+        "dropped": {name: {why: n for why, n in node.dropped.items() if n} for name, node in nodes.items()},
+        "turns": [f"{name}.{field}" for name, node in nodes.items() for field in sorted(node.turning)],
     }
     return Episode(
         steps={name: _steps(t) for name, t in ticks.items()},
@@ -186,80 +159,182 @@ def facts(episode: Episode) -> dict[str, Json]:
     }
 
 
-# -- the signals of a node
+# -- the samples of a node
 
 
-def _stream(table: Table, name: str, node: NodeMapping) -> _Stream:
-    """Read a node's signals, all of the same length; constants are the same in every sample."""
-    stamps = None if node.stamps is None else table.signal(node.stamps)
-    if stamps is not None and stamps.ndim != 1:
-        raise UsageError(
-            f"stamps {node.stamps!r} in {table.path} have the shape {stamps.shape}, expected (N,)",
-            hint=f'choose a column, such as stamps = "{node.stamps}[:,0]"',
-        )
-    signals = {source: table.signal(source) for how in node.fields.values() for source in how.sources}
-    lengths = {source: len(values) for source, values in signals.items() if values.ndim}
-    lengths |= {f"stamps {node.stamps!r}": len(stamps)} if stamps is not None else {}
-    if len(set(lengths.values())) != 1:
-        listed = ", ".join(f"{signal} {length}" for signal, length in lengths.items())
-        raise UsageError(
-            f"the signals of node {name!r} differ in length: {listed}"
-            if lengths
-            else f"node {name!r} gets only constants from {table.path}",
-            hint="put signals with other stamps into another node; the stamps determine a node's samples",
-        )
-    count = next(iter(lengths.values()))
-    if not count:
-        raise UsageError(f"node {name!r} has no samples in {table.path}", hint="check that the file is complete")
-    series = {source: values if values.ndim else np.full(count, values) for source, values in signals.items()}
-    stream = _Stream({}, stamps, np.arange(count), set(), Counter())
-    for field, how in node.fields.items():
-        stream.fields[field] = _field(table, f"{name}.{field}", how, [series[s] for s in how.sources])
-        # A robot with hinges and slides has no unit. Count over all samples, so that a part has the turns of the whole.
-        if how.log_unit == "rad" or (not how.unit and field in ("position", "goal")):
-            scaled = stream.fields[field]
-            counted = checks.counted(scaled.reshape(count, -1), checks.TURN_RAD).reshape(scaled.shape)
-            if not np.array_equal(counted, scaled, equal_nan=True):
-                stream.fields[field] = counted
-                stream.turning.add(field)
-    return stream
+class _Node:
+    """The samples of one node.
 
+    Attributes:
+        fields: Field -> values of all samples in the log's unit, shape ``(N, ...)``.
+        stamps: Shape ``(N,)``, as recorded; None without any.
+        rows: The numbers of the selected samples in the file.
+        turning: Fields with angles that jumped at the end of a turn.
+        dropped: Reason -> number of samples that were left out.
+    """
 
-def _field(table: Table, name: str, how: FieldMapping, parts: Sequence[np.ndarray]) -> np.ndarray:
-    """Return a field's values in the log's unit, shape ``(N, ...)``; a list of sources has the columns of all."""
-    factor, unit = in_si(how.unit)
-    for source, part in zip(how.sources, parts, strict=True):
-        # Jumps by 2^16 or 2^32 are counts that were read with the wrong sign, unless they are a turn.
-        for column in part.reshape(len(part), -1).T if unit == "rad" else ():
-            modulus = checks.unsigned(column)
-            turns = factor * np.abs(np.asarray(how.scale)) * (modulus or 0) / checks.TURN_RAD
-            if modulus is not None and not np.isclose(turns, 1.0, atol=0.01).any():
-                raise UsageError(
-                    f"{source} in {table.path} jumps by {modulus}: signed counts that were read as unsigned, or counts "
-                    f"beyond {modulus.bit_length() - 1} bits",
-                    hint="decode them as signed (two's complement, or a sign bit) before the import",
-                )
-    raw = parts[0]
-    if not isinstance(how.source, str):
-        raw = np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
-    scale, offset = (np.squeeze(x) if np.size(x) == 1 else np.asarray(x) for x in (how.scale, how.offset))
-    for key, numbers in (("scale", scale), ("offset", offset)):
-        if numbers.ndim and numbers.shape != raw.shape[1:]:
+    def __init__(self, table: Table, name: str, mapping: NodeMapping) -> None:
+        self.table, self.name, self.mapping = table, name, mapping
+        self.stamps = None if mapping.stamps is None else table.signal(mapping.stamps)
+        if self.stamps is not None and self.stamps.ndim != 1:
             raise UsageError(
-                f"field {name} has {numbers.size} values of {key} for samples of shape {raw.shape[1:]}",
-                hint="give one number, or one for each column",
+                f"stamps {mapping.stamps!r} in {table.path} have the shape {self.stamps.shape}, expected (N,)",
+                hint=f'choose a column, such as stamps = "{mapping.stamps}[:,0]"',
             )
-    scaled = scale * raw.astype(np.float64) + offset
-    return (scaled if factor == 1.0 else factor * scaled).astype(raw.dtype if raw.dtype.kind == "f" else np.float64)
+        # All signals have one length; constants are the same in every sample.
+        signals = {source: table.signal(source) for how in mapping.fields.values() for source in how.sources}
+        lengths = {source: len(values) for source, values in signals.items() if values.ndim}
+        lengths |= {f"stamps {mapping.stamps!r}": len(self.stamps)} if self.stamps is not None else {}
+        if len(set(lengths.values())) != 1:
+            listed = ", ".join(f"{signal} {length}" for signal, length in lengths.items())
+            raise UsageError(
+                f"the signals of node {name!r} differ in length: {listed}"
+                if lengths
+                else f"node {name!r} gets only constants from {table.path}",
+                hint="put signals with other stamps into another node; the stamps determine a node's samples",
+            )
+        count = next(iter(lengths.values()))
+        if not count:
+            raise UsageError(f"node {name!r} has no samples in {table.path}", hint="check that the file is complete")
+        self.rows, self.dropped = np.arange(count), Counter[str]()
+        series = {source: values if values.ndim else np.full(count, values) for source, values in signals.items()}
+        self.fields = {
+            field: self.scaled(field, [series[s] for s in how.sources]) for field, how in mapping.fields.items()
+        }
+        # A robot with hinges and slides has no unit. Count over all samples, so that a part has the turns of the whole.
+        self.turning: set[str] = set()
+        for field, values in self.fields.items():
+            how = mapping.fields[field]
+            if how.log_unit == "rad" or (not how.unit and field in ("position", "goal")):
+                counted = checks.counted(values.reshape(count, -1), checks.TURN_RAD).reshape(values.shape)
+                if not np.array_equal(counted, values, equal_nan=True):
+                    self.fields[field] = counted
+                    self.turning.add(field)
+
+    def scaled(self, field: str, parts: Sequence[np.ndarray]) -> np.ndarray:
+        """Return a field's values in the log's unit, shape ``(N, ...)``; a list of sources has the columns of all."""
+        how = self.mapping.fields[field]
+        factor, unit = in_si(how.unit)
+        for source, part in zip(how.sources, parts, strict=True):
+            # Jumps by 2^16 or 2^32 are counts that were read with the wrong sign, unless they are a turn.
+            for column in part.reshape(len(part), -1).T if unit == "rad" else ():
+                modulus = checks.unsigned(column)
+                turns = factor * np.abs(np.asarray(how.scale)) * (modulus or 0) / checks.TURN_RAD
+                if modulus is not None and not np.isclose(turns, 1.0, atol=0.01).any():
+                    raise UsageError(
+                        f"{source} in {self.table.path} jumps by {modulus}: signed counts that were read as unsigned, "
+                        f"or counts beyond {modulus.bit_length() - 1} bits",
+                        hint="decode them as signed (two's complement, or a sign bit) before the import",
+                    )
+        raw = parts[0]
+        if not isinstance(how.source, str):
+            raw = np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
+        scale, offset = (np.squeeze(x) if np.size(x) == 1 else np.asarray(x) for x in (how.scale, how.offset))
+        for key, numbers in (("scale", scale), ("offset", offset)):
+            if numbers.ndim and numbers.shape != raw.shape[1:]:
+                raise UsageError(
+                    f"field {self.name}.{field} has {numbers.size} values of {key} for samples of shape "
+                    f"{raw.shape[1:]}",
+                    hint="give one number, or one for each column",
+                )
+        values = scale * raw.astype(np.float64) + offset
+        return (values if factor == 1.0 else factor * values).astype(raw.dtype if raw.dtype.kind == "f" else np.float64)
+
+    def keep(self, good: np.ndarray, reason: str) -> None:
+        """Leave out the selected samples that are not good."""
+        self.dropped[reason] += int((~good).sum())
+        self.rows = self.rows[good]
+
+    def select(self) -> None:
+        """Leave out samples that lack a number, repeat a stamp or leap; refuse positions that no joint can have."""
+        whole = {
+            field: np.isfinite(values).reshape(len(values), -1).all(axis=1)[self.rows]
+            for field, values in self.fields.items()
+        }
+        good = np.logical_and.reduce(list(whole.values()))
+        # Two streams in one table lack numbers in turn. A gain that is written rarely would cost most of the goals.
+        first = next(iter(whole.values()))
+        if (first & ~good).sum() > _MOST_LACKING * max(first.sum(), 1):
+            field = min(whole, key=lambda name: whole[name].sum())
+            raise UsageError(
+                f"field {self.name}.{field} in {self.table.path} has no number in {(~whole[field]).sum()} of "
+                f"{len(good)} samples",
+                hint="remove the field from the mapping, or fill its column",
+            )
+        if self.stamps is not None:
+            good &= np.isfinite(self.stamps[self.rows])
+        self.keep(good, "without a number")
+        if self.stamps is not None and len(self.rows):
+            stamps = self.stamps[self.rows]
+            fresh = np.concatenate([[True], stamps[1:] != stamps[:-1]])
+            if fresh.mean() > 1 - _MOST_REPEATED:  # more of them are stamps that are too coarse
+                self.keep(fresh, "repeated stamp")
+        for field, how in self.mapping.fields.items():
+            if _is_position(field) and how.log_unit == "rad":
+                self.leave_out_glitches(field)
+
+    def leave_out_glitches(self, field: str) -> None:
+        """Leave out samples whose positions leap away and back; refuse a jump without return."""
+        t_s = self.rows / (self.mapping.rate_hz or 1.0)
+        if self.stamps is not None:
+            t_s = self.stamps[self.rows] * (STAMP_UNITS[self.mapping.stamp_unit] * 1e-9)
+        if len(self.rows) < 3 or not (np.isfinite(t_s).all() and (np.diff(t_s) > 0).all()):
+            return  # the check of stamps raises the better error
+        angle = self.fields[field][self.rows].reshape(len(self.rows), -1).astype(np.float64)
+        good = np.asarray(~checks.glitches(t_s, angle).any(axis=1))
+        # It means another zero, another unit or missing samples.
+        if (jump := checks.leap(t_s[good], angle[good])) is not None:
+            k, i, size = jump
+            sources = self.mapping.fields[field].sources
+            source = sources[i] if len(sources) == angle.shape[1] else f"{sources[0]}[:,{i}]"
+            raise UsageError(
+                f"{source} in {self.table.path} changes by {size:.4g} rad before sample {self.rows[good][k]}, within "
+                f"{t_s[good][k] - t_s[good][k - 1]:.3g} s: a joint cannot, so its zero or its unit has changed",
+                hint="cut the file there with --samples A:B, correct the unit, or omit this joint",
+            )
+        self.keep(good, "leap away and back")
+
+    def ticks(self) -> np.ndarray:
+        """Return the stamps of the selected samples, shape ``(N,)``, int64 [us]."""
+        if not len(self.rows):
+            raise UsageError(
+                f"no sample of node {self.name!r} in {self.table.path} is complete", hint="check its columns"
+            )
+        if self.stamps is None:
+            # Use the slots of the timing rules for a node of this rate.
+            slots = (self.rows - self.rows[0]) * 1e6 / (self.mapping.rate_hz or 1.0)
+            return np.floor(slots + 0.5).astype(np.int64)
+        stamps, unit = self.stamps[self.rows], self.mapping.stamp_unit
+        what = f"stamps {self.mapping.stamps!r} of node {self.name!r} in {self.table.path}"
+        hint = f"stamp_unit is {unit!r}; available: {', '.join(STAMP_UNITS)}"
+        nanoseconds = STAMP_UNITS[unit]
+        if np.abs(stamps * (nanoseconds / 1000)).max() >= _MAX_TICKS:
+            raise UsageError(f"{what} are centuries away: {stamps[0]} {unit}", hint=hint)
+        if stamps.dtype.kind == "i":
+            ticks = (stamps + 500) // 1000 if nanoseconds < 1000 else stamps * (nanoseconds // 1000)
+        else:
+            ticks = np.rint(stamps.astype(np.float64) * (nanoseconds / 1000)).astype(np.int64)
+        if (wrong := np.flatnonzero(np.diff(ticks) <= 0)).size:
+            k = int(wrong[0])
+            listed = ", ".join(f"sample {self.rows[i]} at {stamps[i]} {unit}" for i in (k, k + 1))
+            raise UsageError(f"{what} do not increase: {listed}", hint=f"a microsecond apart at least; {hint}")
+        return ticks + round(1e6 * self.mapping.stamp_offset)
+
+    def outputs(self) -> dict[str, np.ndarray]:
+        """Return the selected samples of each field, shape ``(N, ...)``."""
+        return {field: np.ascontiguousarray(values[self.rows]) for field, values in self.fields.items()}
 
 
-def _cut(table: Table, streams: Mapping[str, _Stream], samples: slice | None) -> int:
+def _is_position(field: str) -> bool:
+    named = meaning(field)
+    return named.quantity == "position" and named.side != "command"
+
+
+def _cut(table: Table, nodes: Mapping[str, _Node], samples: slice) -> int:
     """Select a range of samples; return the first."""
-    if samples is None:
-        return 0
     if samples.step not in (None, 1):
         raise UsageError(f"a range of samples has no step, got {samples.step}", hint="remove the step")
-    counts = {name: len(own.rows) for name, own in streams.items()}
+    counts = {name: len(node.rows) for name, node in nodes.items()}
     if len(set(counts.values())) > 1:
         listed = ", ".join(f"{name} {count}" for name, count in counts.items())
         raise UsageError(
@@ -273,134 +348,34 @@ def _cut(table: Table, streams: Mapping[str, _Stream], samples: slice | None) ->
     if beyond or first >= stop:
         text = ":".join("" if n is None else str(n) for n in (samples.start, samples.stop))
         raise UsageError(f"samples {text} are not in {table.path}: it has {count}", hint=f"choose from 0:{count}")
-    for own in streams.values():
-        own.rows = own.rows[first:stop]
+    for node in nodes.values():
+        node.rows = node.rows[first:stop]
     return first
 
 
-def _select(table: Table, name: str, node: NodeMapping, own: _Stream) -> None:
-    """Leave out samples that lack a number, repeat a stamp or leap; refuse positions that no joint can have."""
-    whole = {field: _finite(v)[own.rows] for field, v in own.fields.items()}
-    everywhere = np.ones(len(own.rows), bool)
-    good = np.logical_and.reduce([everywhere, *whole.values()])
-    # Two streams in one table lack numbers in turn. A gain that is written rarely would cost most of the goals.
-    first = next(iter(whole.values()), everywhere)
-    if (first & ~good).sum() > _MOST_LACKING * max(first.sum(), 1):
-        field = min(whole, key=lambda name: whole[name].sum())
-        lacking = int((~whole[field]).sum())
-        raise UsageError(
-            f"field {name}.{field} in {table.path} has no number in {lacking} of {len(good)} samples",
-            hint="remove the field from the mapping, or fill its column",
-        )
-    if own.stamps is not None:
-        good &= np.isfinite(own.stamps[own.rows])
-    own.keep(good, "without a number")
-    if own.stamps is not None and len(own.rows):
-        stamps = own.stamps[own.rows]
-        fresh = np.concatenate([[True], stamps[1:] != stamps[:-1]])
-        if fresh.mean() > 1 - _MOST_REPEATED:  # more of them are stamps that are too coarse
-            own.keep(fresh, "repeated stamp")
-    for field, how in node.fields.items():
-        named = meaning(field)
-        if named.quantity == "position" and named.side != "command" and how.log_unit == "rad":
-            _keep_plausible(table, name, field, node, own)
-
-
-def _keep_plausible(table: Table, name: str, field: str, node: NodeMapping, own: _Stream) -> None:
-    """Leave out samples whose positions leap away and back.
-
-    Raises:
-        UsageError: When positions jump farther than a joint can move, and stay there.
-    """
-    values = own.fields[field]
-    t_s = own.rows / (node.rate_hz or 1.0)
-    if own.stamps is not None:
-        t_s = own.stamps[own.rows] * (STAMP_UNITS[node.stamp_unit] * 1e-9)
-    if len(own.rows) < 3 or not (np.isfinite(t_s).all() and (np.diff(t_s) > 0).all()):
-        return  # the check of stamps raises the better error
-    angle = values[own.rows].reshape(len(own.rows), -1).astype(np.float64)
-    good = np.asarray(~checks.glitches(t_s, angle).any(axis=1))
-    # A jump without return means another zero, another unit or missing samples.
-    if (jump := checks.leap(t_s[good], angle[good])) is not None:
-        k, i, size = jump
-        sources = node.fields[field].sources
-        source = sources[i] if len(sources) == angle.shape[1] else f"{sources[0]}[:,{i}]"
-        raise UsageError(
-            f"{source} in {table.path} changes by {size:.4g} rad before sample {own.rows[good][k]}, within "
-            f"{t_s[good][k] - t_s[good][k - 1]:.3g} s: a joint cannot, so its zero or its unit has changed",
-            hint="cut the file there with --samples A:B, correct the unit, or omit this joint",
-        )
-    own.keep(good, "leap away and back")
-
-
-def _samples(table: Table, name: str, field: str, own: _Stream) -> np.ndarray:
-    """Return the selected samples of a field, shape ``(N, ...)``."""
-    values = own.fields[field][own.rows]
-    if not values.size or not np.isfinite(values).all():
-        raise UsageError(
-            f"field {name}.{field} has no finite number in {table.path}", hint="check the file, or remove the field"
-        )
-    return np.ascontiguousarray(values)
-
-
-def _ticks(table: Table, name: str, node: NodeMapping, own: _Stream) -> np.ndarray:
-    """Return the stamps of the selected samples, shape ``(N,)``, int64 [us]."""
-    if own.stamps is None:
-        # Use the slots of the timing rules for a node of this rate.
-        return np.floor((own.rows - own.rows[:1]) * 1e6 / (node.rate_hz or 1.0) + 0.5).astype(np.int64)
-    stamps = own.stamps[own.rows]
-    what = f"stamps {node.stamps!r} of node {name!r}"
-    hint = f"stamp_unit is {node.stamp_unit!r}; available: {', '.join(STAMP_UNITS)}"
-    nanoseconds = STAMP_UNITS[node.stamp_unit]
-    if not len(stamps):
-        raise UsageError(f"no sample of node {name!r} in {table.path} is complete", hint="check its columns")
-    if np.abs(stamps * (nanoseconds / 1000)).max() >= _MAX_TICKS:
-        raise UsageError(f"{what} in {table.path} are centuries away: {stamps[0]} {node.stamp_unit}", hint=hint)
-    if stamps.dtype.kind == "i":
-        ticks = (stamps + 500) // 1000 if nanoseconds < 1000 else stamps * (nanoseconds // 1000)
-    else:
-        ticks = np.rint(stamps.astype(np.float64) * (nanoseconds / 1000)).astype(np.int64)
-    if (wrong := np.flatnonzero(np.diff(ticks) <= 0)).size:
-        k = int(wrong[0])
-        raise UsageError(
-            f"{what} in {table.path} do not increase: sample {own.rows[k]} at {stamps[k]} {node.stamp_unit}, "
-            f"sample {own.rows[k + 1]} at {stamps[k + 1]} {node.stamp_unit}",
-            hint=f"samples must be a microsecond apart at least; {hint}",
-        )
-    return ticks + round(1e6 * node.stamp_offset)
-
-
 def _align_turns(
-    mapping: ImportMapping,
-    streams: Mapping[str, _Stream],
-    outputs: Mapping[str, dict[str, np.ndarray]],
-    ticks: Mapping[str, np.ndarray],
+    nodes: Mapping[str, _Node], outputs: Mapping[str, dict[str, np.ndarray]], ticks: Mapping[str, np.ndarray]
 ) -> None:
     """Shift commands to the turn of their positions, as turns are counted from the start of each signal."""
+    # Fields without a unit are those of a robot with hinges and slides.
     angles = [
-        (name, field)
-        for name, node in mapping.nodes.items()
-        for field, how in node.fields.items()
-        if how.log_unit in ("rad", "")  # without a unit where a robot has hinges and slides
+        (n, f) for n, node in nodes.items() for f, how in node.mapping.fields.items() if how.log_unit in ("rad", "")
     ]
-    positions = [a for a in angles if meaning(a[1]).quantity == "position" and meaning(a[1]).side != "command"]
-    for name, field in positions:
-        for other, goal in angles:
+    for name, field in angles:
+        for other, goal in angles if _is_position(field) else ():
             a, b = outputs[name][field], outputs[other][goal]
-            has_turns = field in streams[name].turning or goal in streams[other].turning
-            if meaning(goal).side != "command" or not has_turns:
-                continue
-            if a.shape[1:] != b.shape[1:] or min(len(a), len(b)) < 2:
+            has_turns = field in nodes[name].turning or goal in nodes[other].turning
+            if (
+                meaning(goal).side != "command"
+                or not has_turns
+                or a.shape[1:] != b.shape[1:]
+                or min(len(a), len(b)) < 2
+            ):
                 continue
             q, c = (x.reshape(len(x), -1) for x in (a, b))
             at = np.stack([np.interp(ticks[other], ticks[name], column) for column in q.T], axis=1)
             turned = c - checks.TURN_RAD * np.round(np.median(c - at, axis=0) / checks.TURN_RAD)
             outputs[other][goal] = turned.reshape(b.shape)
-
-
-def _finite(values: np.ndarray) -> np.ndarray:
-    """Return whether all numbers of a sample are finite, ``(N,)``."""
-    return np.asarray(np.isfinite(values).reshape(len(values), -1).all(axis=1))
 
 
 def _steps(ticks: np.ndarray) -> Steps:

@@ -173,10 +173,10 @@ class Proposal:
                 values = measured.values[np.isfinite(measured.values).all(axis=1)]
                 odd = checks.odd_columns(in_si(self.fields["sensor"]["position"].unit)[0] * values, self.joints)
                 if odd:
-                    raise UsageError(f"{self.table.path}: {odd[0].text}", hint=checks.hint_for(odd)) from None
+                    error = UsageError(f"{self.table.path}: {odd[0].text}", hint=checks.hint_for(odd))
                 if unproven is None:
-                    raise
-                self.ask_unit(unproven, str(error.args[0]))
+                    raise error from None
+                self.ask_unit(unproven, f"{error.args[0]}{' --joints names the other joints' * bool(odd)}")
                 return
             source = episode.metadata["source"]
             for node, counts in source["dropped"].items():
