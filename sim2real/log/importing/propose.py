@@ -172,11 +172,12 @@ class Proposal:
             except UsageError as error:
                 values = measured.values[np.isfinite(measured.values).all(axis=1)]
                 odd = checks.odd_columns(in_si(self.fields["sensor"]["position"].unit)[0] * values, self.joints)
+                refusal = error
                 if odd:
-                    error = UsageError(f"{self.table.path}: {odd[0].text}", hint=checks.hint_for(odd))
+                    refusal = UsageError(f"{self.table.path}: {odd[0].text}", hint=checks.hint_for(odd))
                 if unproven is None:
-                    raise error from None
-                self.ask_unit(unproven, f"{error.args[0]}{' --joints names the other joints' * bool(odd)}")
+                    raise refusal from None
+                self.ask_unit(unproven, f"{refusal.args[0]}{' --joints names the other joints' * bool(odd)}")
                 return
             source = episode.metadata["source"]
             for node, counts in source["dropped"].items():
