@@ -76,6 +76,16 @@ def test_a_clock_of_another_rate_is_found(rate, weight):
     assert ("clock", -1, weight) in findings(t_q=T * rate)
 
 
+@pytest.mark.parametrize("rate", [0.98, 1.02])
+def test_a_clock_of_another_rate_is_found_in_a_short_gait(rate):
+    """A motion that repeats follows its goal at many lags."""
+    t = T[:1600]
+    goal = 0.4 * np.sin(2 * np.pi * 2.2 * t[:, None] + np.arange(3)) + 0.1 * np.sin(4 * np.pi * 2.2 * t[:, None])
+    q = np.stack([servo(t, column, wn=60.0) for column in goal.T], axis=1)
+    assert [f for f in findings(goal, q, t, t) if f[0] == "clock"] == []
+    assert "clock" in {f[0] for f in findings(goal, q, t, t * rate)}
+
+
 @pytest.mark.parametrize("side", ["reading", "goal"])
 @pytest.mark.parametrize("size", [0.05, -0.3])
 def test_a_zero_that_steps_is_named_with_its_time(side, size):

@@ -28,6 +28,8 @@ _FOLLOWS_R = 0.8
 """A position follows a command from this correlation on."""
 _STILL = 2e-3
 """A joint with a smaller standard deviation does not move [rad or m]."""
+_CLOCK_S = 6.0
+"""Shortest recording whose clocks are compared [s]."""
 _MOST_STEPS = 4
 """A zero that moves more often is no zero."""
 _FASTEST_RAD_S = 60.0
@@ -298,12 +300,17 @@ def _clock(
     acting: np.ndarray | None,
 ) -> list[Check]:
     """Return a finding if the lag grows: two clocks run at different rates."""
-    begin, end = max(t[0] for t in t_s), min(t[-1] for t in t_s)
-    count = min(10, int((end - begin) / 3.0))
-    if count < 4 or not joints:
+    sent_s = t_s[0] if acting is None else t_s[0][acting]
+    if not len(sent_s):
         return []
-    middles, lags = [], []
-    for low, high in itertools.pairwise(np.linspace(begin, end, count + 1).tolist()):
+    begin, end = max(sent_s[0], t_s[1][0]), min(t[-1] for t in t_s)
+    if end - begin < _CLOCK_S or not joints:
+        return []
+    count = int(np.clip((end - begin) / 3.0, 4, 10))
+    parts = list(itertools.pairwise(np.linspace(begin, end, count + 1).tolist()))
+    lags = np.full((count, len(joints)), np.nan)
+    curves: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
+    for row, (low, high) in enumerate(parts):
         sent = np.flatnonzero((t_s[0] >= low - 1.0) & (t_s[0] <= high + 1.0))
         read = np.flatnonzero((t_s[1] >= low) & (t_s[1] <= high))
         if min(len(sent), len(read)) < 60:
@@ -312,19 +319,30 @@ def _clock(
         part = respond((t_s[0][sent], t_s[1][read]), c, q, None if acting is None else acting[sent])
         if part is None:
             continue
-        own = [
-            part.best(k, k, 1.0, _LAGS_S[0])[:2] for k in range(len(joints)) if min(s[k] for s in part.spread) > _STILL
-        ]
-        if own := [lag for r, lag in own if r > 0.9]:
-            middles.append(0.5 * (low + high))
-            lags.append(float(np.median(own)))
-    if len(lags) < 4:
+        for k in range(len(joints)):
+            # A motion that repeats fits at many lags: take the one next to that of the part before.
+            known = lags[np.isfinite(lags[:, k]), k]
+            r = part.r[:, k, k]
+            best = int(np.argmax(r if not len(known) else np.where(np.abs(part.lag_s - known[-1]) < 0.15, r, -1.0)))
+            if r[best] > 0.9 and min(s[k] for s in part.spread) > _STILL:
+                lags[row, k], curves[row, k] = part.lag_s[best], (part.lag_s, r)
+    # One rate for all joints, each of which has a lag of its own.
+    known = [(row, k) for row, k in curves if np.isfinite(lags[:, k]).mean() > 0.7]
+    if not known:
         return []
-    rate, start = np.polyfit(middles, lags, 1)
-    rest = np.asarray(lags) - (rate * np.asarray(middles) + start)
+    rows, of = np.array(known).T
+    seconds, found = np.mean(parts, axis=1)[rows], lags[rows, of]
+    usual = np.nanmean(lags, axis=0)[of]
+    seconds = seconds - np.array([seconds[of == k].mean() for k in of])
+    rate = float(seconds @ (found - usual) / (seconds @ seconds))
+    rest = found - usual - rate * seconds
+    # A slow motion fits its usual lag as well.
+    best, fixed = (
+        np.mean([1 - np.interp(lag, *curves[at]) for at, lag in zip(known, x, strict=True)]) for x in (found, usual)
+    )
     grown = rate * (end - begin)
     period_s = max(float(np.median(np.diff(t))) for t in t_s)
-    if abs(grown) < max(0.02, 2.5 * period_s) or rest.std() > 0.15 * abs(rate) * np.ptp(middles):
+    if abs(grown) < max(0.02, 2.5 * period_s) or rest.std() > 0.15 * abs(grown) or fixed < 2 * best + 1e-4:
         return []
     text = (
         f"the lag of positions behind goals grows by {1e3 * rate:.1f} ms each second ({1e3 * grown:.0f} ms in all): "

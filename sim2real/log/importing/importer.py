@@ -248,7 +248,7 @@ class _Node:
     def select(self) -> None:
         """Leave out samples that lack a number, repeat a stamp or leap; refuse positions that no joint can have."""
         whole = {
-            field: np.isfinite(values).reshape(len(values), -1).all(axis=1)[self.rows]
+            field: np.asarray(np.isfinite(values).reshape(len(values), -1).all(axis=1))[self.rows]
             for field, values in self.fields.items()
         }
         good = np.logical_and.reduce(list(whole.values()))

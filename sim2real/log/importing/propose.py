@@ -224,7 +224,7 @@ class Proposal:
         """Return the column of each joint of the robot, and the joints' names."""
         labels, joints, at = measured.labels, self.hints.joints, ("sensor", "position", "source")
         if not joints:
-            finite = np.isfinite(measured.values).any(axis=0).tolist()
+            finite: list[bool] = np.asarray(np.isfinite(measured.values).any(axis=0)).tolist()
             if empty := [source for source, good in zip(measured.sources, finite, strict=True) if not good]:
                 self.evidence.append(f"skipped: {', '.join(empty)} has no number in any sample")
             kept = [i for i, good in enumerate(finite) if good]
@@ -481,8 +481,9 @@ class Proposal:
         if wrong:
             text = "; ".join(f.text for f in wrong)
             raise UsageError(f"{self.table.path}: {text}", hint=checks.hint_for(wrong))
-        goal = self.fields["actuator"].get("goal")
-        for key in dict.fromkeys(f.question for f in open_ones) if goal is not None else ():
+        if (goal := self.fields["actuator"].get("goal")) is None:
+            return
+        for key in dict.fromkeys(f.question for f in open_ones):
             those = [f for f in open_ones if f.question == key]
             why = "; ".join(f.text for f in those)
             if self.hints.unit and all(f.name == "follows" for f in those):
