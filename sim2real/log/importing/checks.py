@@ -6,7 +6,7 @@ Goals and measured positions in one unit are compared joint by joint: order, sig
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -110,7 +110,9 @@ def check(
     findings = [wrong for wrong, _, _ in judged if wrong is not None]
     following = [i for i, (wrong, _, _) in enumerate(judged) if wrong is None]
     moving = [i for i, (_, moves, _) in enumerate(judged) if moves]
-    clock = _clock(t_s, goal, position, following or moving, acting)
+    opposed = {f.joint for f in findings if f.name in ("sign", "order")}
+    begin_s = {i: judged[i][2] if i in following else None for i in following or moving if i not in opposed}
+    clock = _clock(t_s, goal, position, begin_s, acting)
     rates = _rates(t_s, goal[:, moving], position[:, moving]) if moving else []
     if any(f.weight == "refuse" for f in clock):
         findings = [f for f in findings if f.name not in ("follows", "lag")]
@@ -296,10 +298,15 @@ def _clock(
     t_s: tuple[np.ndarray, np.ndarray],
     goal: np.ndarray,
     position: np.ndarray,
-    joints: Sequence[int],
+    lag_s: Mapping[int, float | None],
     acting: np.ndarray | None,
 ) -> list[Check]:
-    """Return a finding if the lag grows: two clocks run at different rates."""
+    """Return a finding if the lag grows: two clocks run at different rates.
+
+    Args:
+        lag_s: Joint -> the lag that fits the whole recording [s]; None if none does.
+    """
+    joints = list(lag_s)
     sent_s = t_s[0] if acting is None else t_s[0][acting]
     if not len(sent_s):
         return []
@@ -319,11 +326,11 @@ def _clock(
         part = respond((t_s[0][sent], t_s[1][read]), c, q, None if acting is None else acting[sent])
         if part is None:
             continue
-        for k in range(len(joints)):
+        for k, joint in enumerate(joints):
             # A motion that repeats fits at many lags: take the one next to that of the part before.
             known = lags[np.isfinite(lags[:, k]), k]
-            r = part.r[:, k, k]
-            best = int(np.argmax(r if not len(known) else np.where(np.abs(part.lag_s - known[-1]) < 0.15, r, -1.0)))
+            last, r = known[-1] if len(known) else lag_s[joint], part.r[:, k, k]
+            best = int(np.argmax(r if last is None else np.where(np.abs(part.lag_s - last) < 0.15, r, -1.0)))
             if r[best] > 0.9 and min(s[k] for s in part.spread) > _STILL:
                 lags[row, k], curves[row, k] = part.lag_s[best], (part.lag_s, r)
     # One rate for all joints, each of which has a lag of its own.
@@ -332,8 +339,8 @@ def _clock(
         return []
     rows, of = np.array(known).T
     seconds, found = np.mean(parts, axis=1)[rows], lags[rows, of]
-    usual = np.nanmean(lags, axis=0)[of]
-    seconds = seconds - np.array([seconds[of == k].mean() for k in of])
+    usual, middle = (np.array([x[of == k].mean() for k in of]) for x in (found, seconds))
+    seconds = seconds - middle
     rate = float(seconds @ (found - usual) / (seconds @ seconds))
     rest = found - usual - rate * seconds
     # A slow motion fits its usual lag as well.
