@@ -110,7 +110,7 @@ def check(
     findings = [wrong for wrong, _, _ in judged if wrong is not None]
     following = [i for i, (wrong, _, _) in enumerate(judged) if wrong is None]
     moving = [i for i, (_, moves, _) in enumerate(judged) if moves]
-    opposed = {f.joint for f in findings if f.name in ("sign", "order")}
+    opposed = {f.joint for f in findings if f.weight == "refuse" and f.name in ("sign", "order")}
     begin_s = {i: judged[i][2] if i in following else None for i in following or moving if i not in opposed}
     clock = _clock(t_s, goal, position, begin_s, acting)
     rates = _rates(t_s, goal[:, moving], position[:, moving]) if moving else []
