@@ -18,8 +18,8 @@ from sim2real.stages.load import available
 ROOT = Path(sim2real.__file__).parents[1]
 COMMAND = re.compile(rf"(?P<quote>`?)sim2real (?P<name>{'|'.join(cli.COMMANDS)})\b(?P<rest>[^`;\n]*)")
 FLAG = re.compile(r"(?<![\w-])--[a-z][a-z-]*(?:\.[a-z-]*[a-z])*(?![\w-])")
-OTHERS = re.compile(r"(mcap cat|rosbags-convert) [^`]*|--plant(-args)?")
-"""Commands of other programs, and flags of the emulation's process."""
+OTHERS = re.compile(r"(mcap cat|rosbags-convert) [^`]*|--plant(-args)?|var\(--[^)]*\)")
+"""Commands of other programs, flags of the emulation's process, and colours of a page."""
 TAKE_A_PIPELINE = ("record", "identify", "train", "deploy", "run", "check")
 
 
