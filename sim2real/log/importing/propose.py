@@ -469,7 +469,8 @@ class Proposal:
             asked: Node and field whose unit is open where no position follows its goal.
         """
         open_ones = [f for f in findings if f.weight in ("ask", "refuse")]
-        told = [f for f in findings if f.weight == "warn"] + (open_ones if self.hints.as_told else [])
+        told = [f for f in findings if f.weight == "warn" and not any(f.text in other.text for other in open_ones)]
+        told += open_ones if self.hints.as_told else []
         self.evidence += [f.text for f in findings if f.weight == "note"]
         self.evidence += [f"warning: {f.text}" for f in told]
         if self.hints.as_told:
