@@ -15,16 +15,18 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from sim2real.artifacts.paths import shown
 from sim2real.errors import Sim2RealError
 from sim2real.robots.robot import RecordedRobot, Robot, joint_columns
 from sim2real.stages.terminal.console import note
 from sim2real.types import Json
-from sim2real.view.live.follower import PERIOD_S, Follower
 from sim2real.view.model_scene import ModelScene
-from sim2real.view.rerun_recording import Scene
 from sim2real.view.rerun_viewer import open_viewer, rerun_module
+
+if TYPE_CHECKING:
+    from sim2real.view.rerun_recording import Scene
 
 _START_S = 30.0
 """Longest wait for the viewer, before torque goes on [s]."""
@@ -138,6 +140,8 @@ def _message(process: subprocess.Popen[str], wait_s: float) -> Mapping[str, Json
 
 def main() -> None:
     """Follow the folder that the first line of the standard input names."""
+    from sim2real.view.live.follower import PERIOD_S, Follower  # needs matplotlib, which a robot's computer lacks
+
     # The viewer inherits the priority: every other program comes first. Only Linux has the second one.
     with suppress(OSError):
         os.nice(_NICENESS)
@@ -173,6 +177,8 @@ def follow(run_dir: Path, name: str, target: str, scene: Scene | None) -> None:
     Raises:
         Sim2RealError: The viewer does not start.
     """
+    from sim2real.view.live.follower import PERIOD_S, Follower
+
     recording = rerun_module().RecordingStream(f"sim2real {name}")
     note(f"view: {open_viewer(recording, target)}")
     follower = Follower(recording, lambda: sorted(p for p in run_dir.iterdir() if p.is_dir()), scene)
