@@ -14,12 +14,13 @@ import numpy as np
 
 from sim2real import pytree
 from sim2real.errors import UsageError
-from sim2real.graph.base import Base, GraphState, StepState
+from sim2real.graph.base import Base, GraphState, StepState, Value
 from sim2real.graph.node import BaseNode
 from sim2real.identification.model import PlainSimulation, converged
+from sim2real.robots.loop import delay_of
 from sim2real.robots.model.file import one_line, read_spec
 from sim2real.robots.model.held import Holding, apply, plan
-from sim2real.types import Array, Json, Key, MjModel, MjSpec, PyTree
+from sim2real.types import Array, Json, Key, MjModel, MjSpec, PyTree, Scalar
 from sim2real.worlds.drive_terms import NO_LIMIT, DriveTerms
 from sim2real.worlds.driven import PAYLOAD, DrivenWorld, DriveParams, payload_place
 
@@ -302,6 +303,9 @@ class Encoders(BaseNode):
         still = jnp.zeros(len(self._world.qpos_at))
         return Measured(still, still if self._velocity else None)
 
+    def init_delays(self, rng: Key | None = None, graph_state: GraphState | None = None) -> dict[str, Value]:
+        return delay_of(self.name, self._world.name, graph_state)
+
     def step(self, step_state: StepState) -> tuple[StepState, Measured]:
         message, params = step_state.inputs[self._world.name][-1].data, step_state.params
         angle, speed = message.qpos[self._world.qpos_at], message.qvel[self._world.qvel_at]
@@ -317,10 +321,12 @@ class EncoderParams(Base):
     Attributes:
         zero: Readings at the model's zero, ``(joints,)`` [rad].
         terms: The drives' own, which say how far each is off its axis; None: not at all.
+        delay: Of the readings [s]; None: as the connection was made.
     """
 
     zero: Array
     terms: DriveTerms | None = None
+    delay: Scalar | None = None
 
 
 def driven_simulation(

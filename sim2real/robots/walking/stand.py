@@ -9,19 +9,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sim2real import pytree
 from sim2real.errors import OtherMotion
-from sim2real.graph.base import GraphState, Value
 from sim2real.graph.episode import Episode
 from sim2real.graph.node import BaseNode
 from sim2real.identification.model import Channel
 from sim2real.identification.parameters import Parameter, ParameterTable
-from sim2real.robots.loop import ACTUATOR, SENSOR, WORLD, DelayParams, delay_of, delay_parameters, recorded_loop
+from sim2real.robots.loop import ACTUATOR, SENSOR, WORLD, DelayParams, delay_parameters, recorded_loop
 from sim2real.robots.model.drives import EncoderParams, Encoders, driven_spec
 from sim2real.robots.model.file import read_spec
 from sim2real.robots.walking.drive import gravity_of
 from sim2real.robots.walking.world import MOTOR_STRENGTH, JointParameters
-from sim2real.types import Array, Key, MjModel, PyTree, Scalar
+from sim2real.types import Array, MjModel, PyTree, Scalar
 from sim2real.worlds.driven import DriveCommand, DrivenWorld
 from sim2real.worlds.mjx import MjxState
 from sim2real.worlds.recorded import RecordedActuator
@@ -64,7 +62,7 @@ class LegsInAStand:
     def nodes(self, max_delay_s: float) -> dict[str, BaseNode]:
         """Return sensor, actuator and world, connected with delays of up to ``max_delay_s`` [s]."""
         world, still = self._make_world(), jnp.zeros(len(self._joints.motors))
-        sensor = _Sensor(SENSOR, self._rate_hz, world, velocity=True)
+        sensor = Encoders(SENSOR, self._rate_hz, world, velocity=True)
         command = DriveCommand(goal=still, goal_velocity=still, torque=still, kp=still, kd=still)
         actuator = RecordedActuator(ACTUATOR, self._rate_hz, command)
         return recorded_loop(sensor, actuator, world, max_delay_s, self.ahead_s, world.lead_s)
@@ -113,7 +111,7 @@ class LegsInAStand:
         late_s = values["sensor_delay"] + self.ahead_s
         return {
             WORLD: self._world.started(world, state[:count] - zero, state[count:]),
-            SENSOR: _SensorParams(zero=zero, delay=late_s),
+            SENSOR: EncoderParams(zero=zero, delay=late_s),
             ACTUATOR: DelayParams(values["actuator_delay"]),
         }
 
@@ -136,19 +134,3 @@ class _World(DrivenWorld):
     def message(self, state: PyTree, qpos: jax.Array, qvel: jax.Array, qacc: jax.Array) -> MjxState:
         # MuJoCo's velocities are half a step older than its positions.
         return super().message(state, qpos, qvel + 0.5 * (STEP_S - FINE_S) * qacc, qacc)
-
-
-@pytree.dataclass
-class _SensorParams(EncoderParams):
-    delay: Scalar | None = None
-
-
-class _Sensor(Encoders):
-    """Encoders with a delay."""
-
-    def init_params(self, rng: Key | None = None, graph_state: GraphState | None = None) -> _SensorParams:
-        return _SensorParams(super().init_params(rng, graph_state).zero)
-
-    def init_delays(self, rng: Key | None = None, graph_state: GraphState | None = None) -> dict[str, Value]:
-        del rng
-        return delay_of(self.name, WORLD, graph_state)
