@@ -114,7 +114,9 @@ def test_a_slip_and_a_turn_of_the_goals_are_said_also_where_nothing_follows(size
 
 
 def test_an_offset_at_rest_is_said():
-    assert findings(q=Q + np.array([0, 0, 0.12])) == [("zero", 2, "warn")]
+    assert findings(q=Q + np.array([0, 0, 0.12])) == [("offset", 2, "warn")]
+    assert findings(q=Q + np.array([0, 0, 1.5])) == [("offset", 2, "ask")]
+    assert "offset" in checks.hint_for(checks.check((T, T), GOAL, Q + np.array([0, 0, 1.5]), NAMES)[-1:])
 
 
 def test_commands_that_are_too_slow_for_the_motion_are_said():

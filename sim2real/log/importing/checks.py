@@ -71,6 +71,7 @@ CHECKS = {
     "clock": ("", "stamp both streams with one clock, such as a recorder's"),
     "copy": ("", "log the commands that were sent, not the measurements"),
     "zero": ("", "cut the file where the zero moves: --samples A:B"),
+    "offset": ("", "give the goals an offset in a mapping, one number for each column"),
     "scale": ("", "name the other joints with --joints, or give the column its own scale in a mapping"),
     "rate": ("", "log both sides faster than the motion"),
     "still": ("", "move the joint"),
@@ -418,7 +419,7 @@ def _zero(
     offset = float(np.median(error))
     if abs(offset) > 0.05 and abs(offset) > 2.0 * float(np.median(np.abs(error - offset))):
         text = f"{name} reads {offset:+.3f} rad against its goal on average: zeros differ, or a load pulls"
-        return [Check("zero", i, text, "ask" if abs(offset) > 1.0 else "warn")]
+        return [Check("offset", i, text, "ask" if abs(offset) > 1.0 else "warn")]
     return []
 
 
