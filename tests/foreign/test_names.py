@@ -24,28 +24,6 @@ def table(path, goal="goal_{}_rad", q="q_{}_rad", stamps="t_s", factor=1.0, **mo
     return csv(path / "run.csv", columns | more)
 
 
-@pytest.mark.parametrize(
-    ("goal", "q", "factor"),
-    [
-        ("goal_{}_rad", "q_{}_rad", 1.0),
-        ("{}_cmd_rad", "{}_pos_rad", 1.0),
-        ("q_des_{} [deg]", "q_{} [deg]", 180 / np.pi),
-        ("target.{} (degrees)", "position.{} (degrees)", 180 / np.pi),
-        ("action.{}.pos_rad", "observation.{}.pos_rad", 1.0),
-        ("command/{}/position_turns", "state/{}/position_turns", 0.5 / np.pi),
-        ("joint_command.position.{}", "joint_states.position.{}", 1.0),
-        ("ctrl_{}_rad", "qpos_{}", 1.0),
-        ("desired_{}_deg", "actual_angle_{}_deg", 180 / np.pi),
-    ],
-)
-def test_ordinary_names_are_right_at_once(tmp_path, goal, q, factor):
-    episode, found = imported(table(tmp_path, goal, q, factor=factor))
-    np.testing.assert_allclose(episode.outputs["sensor"]["position"], Q, atol=2e-5)
-    np.testing.assert_allclose(episode.outputs["actuator"]["goal"], GOAL, atol=2e-5)
-    assert found.joints == ("a", "b")
-    assert episode.units["sensor"]["position"] == "rad"
-
-
 @pytest.mark.parametrize("degrees", [0.9, 20.0, 500.0])
 def test_a_unit_that_no_name_has_is_asked_however_small_or_large_the_motion(tmp_path, degrees):
     path = table(tmp_path, "goal_{}", "q_{}", factor=degrees)

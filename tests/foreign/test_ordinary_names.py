@@ -28,6 +28,9 @@ NAMES = (
 """Joints."""
 OF_UNIT = [
     ("goal_{j}_{u}", "q_{j}_{u}"),
+    ("action.{j}.pos_{u}", "observation.{j}.pos_{u}"),
+    ("command/{j}/position_{u}", "state/{j}/position_{u}"),
+    ("ctrl_{j}_{u}", "qpos_{j}_{u}"),
     ("q_des_{j}_{u}", "q_{j}_{u}"),
     ("{j}_goal_{u}", "{j}_pos_{u}"),
     ("{j}.goal_{u}", "{j}.pos_{u}"),
@@ -75,7 +78,7 @@ def written(seed, folder):
     rng = np.random.default_rng(seed)
     styles = [*itertools.product(OF_UNIT, ["rad", "deg", "deg", "rev", "mrad"]),
               *itertools.product(IN_RADIANS * 4, ["rad"]), *itertools.product(WITHOUT * 4, ["deg"])]  # fmt: skip
-    (goal, q), unit = styles[seed * 37 % len(styles)]
+    (goal, q), unit = styles[np.random.default_rng(0).permutation(len(styles))[seed % len(styles)]]
     word = str(rng.choice({"deg": ["deg", "degrees"], "rev": ["rev", "turns"]}.get(unit, [unit])))
     stamps, factor = list(TIMES.items())[int(rng.integers(len(TIMES)))]
     names = NAMES[int(rng.integers(len(NAMES)))]
@@ -102,6 +105,7 @@ def outcome(path):
     if found.questions:
         return f"{', '.join(table.keys)}: {found.open_questions()}"
     episode = import_table(table, found.mapping)
+    assert episode.units["sensor"]["position"] == "rad"
     np.testing.assert_allclose(episode.outputs["sensor"]["position"], Q, atol=2e-4)
     np.testing.assert_allclose(episode.outputs["actuator"]["goal"], GOAL, atol=2e-4)
     start_us = episode.steps["sensor"].start

@@ -273,7 +273,7 @@ def _judge(found: Response, i: int, names: Sequence[str], by_name: bool, t_s: tu
         ("order", "refuse", other_r > 0.9 and best < 0.6,
          f"{name} follows the goal of {names[other]} (r {other_r:.2f}), not its own (r {best:.2f})"),
         ("order", "ask", rival >= 0,
-         f"{name} follows its own goal and that of column {rival} alike (r {best:.2f} and {rival_r:.2f})"),
+         f"{name} follows its own goal and that of {names[rival]} alike (r {best:.2f} and {rival_r:.2f})"),
         ("lag", "refuse", best < _FOLLOWS_R and leads, before),
         ("follows", "warn", best < _FOLLOWS_R,
          f"{name} does not follow its goal (r {best:.2f} at most): sign, unit and order are not checked"),
