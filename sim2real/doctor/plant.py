@@ -518,7 +518,7 @@ def parting(replay: Replay, plant: Setting, joints: Sequence[str]) -> dict[str, 
             robot[:, 3:7] = log.quat[np.searchsorted(log.state_t, times[shown] + h).clip(0, len(log.quat) - 1)]
     return {
         "time_s": begin, "joint": joints[joint], "apart": bool(len(worse)), "error": float(error[first, joint]),
-        "t": (times[shown] + h - begin).tolist(),
+        "free": d.free, "t": (times[shown] + h - begin).tolist(),
         "measured": measured[:, joint].tolist(), "simulated": simulated[:, d.qpos[joint]].tolist(),
         "film": {"measured": drawn(d.model, robot), "simulated": drawn(d.model, simulated)},
     }  # fmt: skip

@@ -134,6 +134,7 @@ def _film(at: Mapping[str, Any]) -> FigureBlock:
     clock = f'<rect x="20" y="{high:.0f}" height="3" width="0" fill="var(--muted, gray)">{clock}</rect>'
     end_s = at["time_s"] + at["t"][-1]
     caption = f"Robot and model under the same commands from {at['time_s']:.2f} s to {end_s:.2f} s, in slow motion."
+    caption += " Where the robot's base went is not measured." * at["free"]
     size = f'width="{72 * PHONE_IN:.0f}pt" viewBox="0 0 {wide:.0f} {high + 10:.0f}"'
     svg = f'<svg role="img" aria-label="{caption}" {size} font-size="12" fill="var(--ink, black)">{shown}{clock}</svg>'
     return FigureBlock(svg, caption)

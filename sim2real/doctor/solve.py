@@ -13,7 +13,7 @@ from scipy.optimize import least_squares, linear_sum_assignment
 
 from sim2real.doctor.contract import Policy
 from sim2real.doctor.deployed import FRAMES, Deployed, known
-from sim2real.doctor.log import Log
+from sim2real.doctor.log import Log, newest
 from sim2real.doctor.search import Candidate, Finding, Setting, Suspect, explain, shortened
 
 _SOUND, _FINE = 0.01, 0.0015
@@ -337,19 +337,23 @@ def solve_contract(
 
 
 def frozen_sensors(log: Log, joints: Sequence[str]) -> list[Finding]:
-    """Return a finding if the IMU or a joint repeats its values while others move."""
-    change = np.abs(np.diff(log.q, axis=0)) > 1e-4
-    imu = [("frozen imu", f"the IMU's {n}", getattr(log, n), change.any(1)) for n in ("gyro", "quat")]
-    of_joints = [("frozen joint", f"the encoder of {joint}", log.q[:, [i]], np.delete(change, i, 1).all(1))
-                 for i, joint in enumerate(joints) if len(joints) > 1]  # fmt: skip
+    """Return a finding if the IMU repeats itself while joints move, or a joint while its commands do."""
+    moving = np.abs(np.diff(log.q, axis=0)).max(1) > 1e-4
+    given = log.action if log.target is None else log.target
+    commands = None if given is None else given[newest(log.t, log.state_t)].T
+    sensors = [("frozen imu", f"the IMU's {n}", getattr(log, n), None) for n in ("gyro", "quat")]
+    of_joints = () if commands is None else zip(joints, log.q.T, commands, strict=True)
+    sensors += [("frozen joint", f"the encoder of {joint}", q[:, None], command) for joint, q, command in of_joints]
     findings: dict[str, Finding] = {}
-    for fault, what, values, moving in [*imu, *of_joints]:
+    for fault, what, values, command in sensors:
         if values is None:
             continue
         same = (np.diff(values, axis=0) == 0.0).all(1)
         ends = np.concatenate([[-1], np.flatnonzero(~same & moving), [len(same)]])
         longest = int(np.argmax(np.diff(ends)))
         begin, end = ends[longest] + 1, ends[longest + 1]
+        if command is not None and np.ptp(command[begin : end + 1]) <= 0.3 * np.ptp(command):  # a joint at rest
+            continue
         from_s, for_s = float(log.state_t[begin]), float(log.state_t[end] - log.state_t[begin])
         if for_s > 0.5 and (same & moving)[begin:end].sum() > 20:
             text = f"{what} repeats one value for {for_s:.1f} s from {from_s:.2f} s on, while joints move"

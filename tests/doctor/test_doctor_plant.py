@@ -16,6 +16,7 @@ from sim2real.doctor.diagnosis import diagnose, solve_timing
 from sim2real.doctor.log import read_deployment
 from sim2real.doctor.plant import Drives, driven_joints, solve_plant
 from sim2real.doctor.search import shortened
+from sim2real.doctor.solve import frozen_sensors
 
 XML = """<mujoco><option timestep="0.0025"/><worldbody><body>
 <joint name="a" axis="0 1 0" damping="0.01" armature="0.003"/>
@@ -97,9 +98,13 @@ def test_the_plant_is_judged_until_a_sensor_freezes(tmp_path: Path) -> None:
     q, dq = log.q.copy(), log.dq.copy()
     q[200:, 1], dq[200:, 1] = q[200, 1], 0.0
     policy = Policy(network(np.random.default_rng(0), 4, joints=2), CONTRACT)
-    found = diagnose(policy, replace(log, q=q, dq=dq), Drives(tmp_path / "robot.xml", CONTRACT))
+    frozen = replace(log, q=q, dq=dq)
+    found = diagnose(policy, frozen, Drives(tmp_path / "robot.xml", CONTRACT))
     assert "frozen joint" in found.faults
     assert not [f for f in found.findings if f.question == "plant"]
+    assert frozen.target is not None
+    at_rest = replace(frozen, target=frozen.target * [1, 0])  # such as a gripper that is to do nothing
+    assert frozen_sensors(at_rest, CONTRACT.joints) == []
 
 
 def test_torque_at_the_limit_of_the_model_is_no_fault(tmp_path: Path) -> None:
