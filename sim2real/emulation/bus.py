@@ -141,11 +141,6 @@ class PlannedBus(PlannedRobot[B]):
         self._sequence = 0
         self.begin_faults(0)
 
-    @property
-    def baud_rate(self) -> int:
-        """Bits per second on the wire."""
-        return self.config.baud_rate
-
     @abstractmethod
     def execute(self, request: Request) -> None:
         """Carry out an instruction that is complete on the wire, and reply to it."""
@@ -305,7 +300,7 @@ class VirtualRobot(VirtualTime):
 
     def write(self, data: bytes) -> None:
         self._require_port()
-        if self._baud_rate == self.bus.baud_rate:
+        if self._baud_rate == self.bus.config.baud_rate:
             self.feed(data)
 
     def read(self, until_ns: int) -> bytes:

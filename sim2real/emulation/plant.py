@@ -214,7 +214,7 @@ class MountedPlant:
 
     def command(self, servo_id: int, mode: int, goal: float) -> None:
         joint = self._joints[servo_id]
-        if mode in (OperatingMode.POSITION, OperatingMode.EXTENDED_POSITION):
+        if mode == OperatingMode.POSITION:
             goal = joint.angle(goal - self._zero_rad) + self._zero_rad
         elif mode == OperatingMode.VELOCITY:
             goal = joint.speed(goal)

@@ -145,7 +145,6 @@ class OperatingMode(IntEnum):
     OFF = 0
     VELOCITY = 1
     POSITION = 3
-    EXTENDED_POSITION = 4
     PWM = 16
 
 

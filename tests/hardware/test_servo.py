@@ -63,7 +63,7 @@ def test_present_registers():
 
 
 OK, OFF = StatusError.NONE, (OperatingMode.OFF, 0.0)
-PWM, VELOCITY, POSITION, EXTENDED = (OperatingMode[n] for n in ("PWM", "VELOCITY", "POSITION", "EXTENDED_POSITION"))
+PWM, VELOCITY, POSITION = (OperatingMode[n] for n in ("PWM", "VELOCITY", "POSITION"))
 
 
 @pytest.mark.parametrize(
@@ -72,7 +72,6 @@ PWM, VELOCITY, POSITION, EXTENDED = (OperatingMode[n] for n in ("PWM", "VELOCITY
         (PWM, [(reg.GOAL_PWM, -885, OK)], (PWM, -1.0)),
         (VELOCITY, [(reg.GOAL_VELOCITY, 100, OK)], (VELOCITY, 100 * reg.RAD_S_PER_COUNT)),
         (POSITION, [(reg.GOAL_POSITION, 2048, OK)], (POSITION, math.pi)),
-        (EXTENDED, [(reg.GOAL_POSITION, -5000, OK)], (POSITION, -5000 * reg.RAD_PER_COUNT)),
         (POSITION, [], (POSITION, reg.GOAL_POSITION.count(1.0) * reg.RAD_PER_COUNT)),  # torque on holds the position
         # Settings are locked while torque is on.
         (PWM, [(reg.OPERATING_MODE, POSITION, StatusError.ACCESS), (reg.RETURN_DELAY_TIME, 0, StatusError.ACCESS)],
