@@ -106,7 +106,10 @@ def test_settings_reach_the_servos_and_those_that_were_lost_are_noticed(family, 
         for servo in robot.bus.servos.values():
             assert {register: servo.get(register) for register in expected} == expected
         servos.check()
-        if family is STS:  # of the others the watchdog alone is looked at
+        robot.bus.servos[2].put(family.torque, 0)  # by another program
+        with pytest.raises(SafetyStop, match="servo 2 has lost its settings: torque_enable is 0, not 1"):
+            servos.check()
+        if family is STS:
             robot.bus.servos[2].reboot()
             assert robot.bus.servos[2].get(sts.RETURN_DELAY_TIME) == 250  # nothing was made permanent
             with pytest.raises(SafetyStop, match="servo 2 has lost its settings"):

@@ -24,7 +24,7 @@ FAMILY = Family(
     torque=TORQUE, modes={POSITION_KIND: (0, GOAL)}, goals=(GOAL,), limits=(LOW, HIGH), mode=MODE,
     model_number=MODEL, servo_id=ID,
     return_delay=DELAY, position=POSITION, velocity=VELOCITY, load=LOAD, controller=(P, D, SPEED), firmware=(FIRMWARE,),
-    voltage=VOLTS, temperature=WARMTH, begin={DELAY: 0}, fixed={}, watched=(TORQUE,), full_rad=500.0,
+    voltage=VOLTS, temperature=WARMTH, begin={DELAY: 0}, fixed={}, watched=((TORQUE,),), full_rad=500.0,
     models={7: ServoModel("Acme 7", None, "this file")},
 )  # fmt: skip
 

@@ -40,7 +40,7 @@ FAULTS = {
     "killed": (None, dict.fromkeys(ROBOTS, "is gone: torque is off"), 0.3),
     "stopped": (SafetyStop, dict.fromkeys(ROBOTS, "guardian"), 0.3),
     "no guardian": (SafetyStop, dict.fromkeys(ROBOTS, "guardian has died"), SOON_S),
-    "torque off": (SafetyStop, {"pendulum": "hinge.*push", "arm": "(shoulder|elbow).*away", "so101": "has lost"}, 0.6),
+    "torque off": (SafetyStop, {"pendulum": "push|has lost", "arm": "away|has lost", "so101": "has lost"}, 0.6),
     "lets go": (SafetyStop, {name: f"{joint}.*(away|push)" for name, joint in JOINT.items()}, FOLLOWS_S),
     "slips": (SafetyStop, {n: f"{j}.*(away|push)" for n, j in JOINT.items() if n != "go2"}, 1.0),
     "collides": (SafetyStop, {n: f"{j}.*(away|push|has read)" for n, j in JOINT.items() if n != "go2"}, 1.2),

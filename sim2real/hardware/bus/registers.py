@@ -110,7 +110,8 @@ class Family:
         temperature: The motor's temperature [deg C].
         begin: Values that are written at `open`, such as "answer every instruction".
         fixed: Values that are written before torque goes on, beside those of the controller.
-        watched: Neighbouring registers that `check` compares with the values that were written.
+        watched: Groups of neighbouring registers that `check` compares with the values that were written, a read for
+            each.
         full_rad: Position error times P gain at which the controller gives full torque [rad].
         models: Model number -> model.
         watchdog: Longest silence of the host, after which their own watchdog trips and the register is below 0; 0: off;
@@ -139,7 +140,7 @@ class Family:
     temperature: Register
     begin: Mapping[Register, int]
     fixed: Mapping[Register, int]
-    watched: tuple[Register, ...]
+    watched: tuple[tuple[Register, ...], ...]
     full_rad: float
     models: Mapping[int, ServoModel]
     watchdog: Register | None = None

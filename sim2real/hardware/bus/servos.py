@@ -366,19 +366,20 @@ class Servos(Device):
         if not self.armed:
             return
         family = self.family
-        counts, _ = self.link.read_counts(self.ids, family.watched, "read of the settings")
-        for servo_id, row in zip(self.ids, counts.tolist(), strict=True):
-            expected = {family.torque: 1, family.watchdog: self._watchdog_count, **self.settings(servo_id)}
-            for register, current in zip(family.watched, row, strict=True):
-                if register is family.watchdog and current < 0:
-                    raise self.tripped(servo_id)
-                # `armed` may have changed: another thread took the torque off.
-                if current != expected[register] and self.armed:
-                    raise SafetyStop(
-                        f"servo {servo_id} has lost its settings: {register.name} is {current}, not "
-                        f"{expected[register]}",
-                        hint="did its supply fail for a moment?",
-                    )
+        for registers in family.watched:
+            counts, _ = self.link.read_counts(self.ids, registers, "read of the settings")
+            for servo_id, row in zip(self.ids, counts.tolist(), strict=True):
+                expected = {family.torque: 1, family.watchdog: self._watchdog_count, **self.settings(servo_id)}
+                for register, current in zip(registers, row, strict=True):
+                    if register is family.watchdog and current < 0:
+                        raise self.tripped(servo_id)
+                    # `armed` may have changed: another thread took the torque off.
+                    if current != expected[register] and self.armed:
+                        raise SafetyStop(
+                            f"servo {servo_id} has lost its settings: {register.name} is {current}, not "
+                            f"{expected[register]}",
+                            hint="did its supply fail for a moment, or does another program use the bus?",
+                        )
 
     def tripped(self, servo_id: int) -> SafetyStop:
         """Return the error for a servo whose bus watchdog has tripped."""
