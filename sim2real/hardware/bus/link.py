@@ -314,13 +314,14 @@ class ServoLink:
         self._send(packet)
         end_ns = self._sent_ns + round(1e9 * self.config.reply_timeout_s) + self._wire_ns(packet, servo_ids, length)
         answers = []
-        for servo_id in servo_ids:
-            # Any other answer is a late one to an earlier instruction; a refusal has no data.
+        for i, servo_id in enumerate(servo_ids):
+            # A refusal has no data.
             while (answer := self._next_answer(end_ns)) is not None:
-                refused = not answer.data and answer.error & self.form.refusals
-                if answer.servo_id == servo_id and (len(answer.data) == length or refused):
+                fits = len(answer.data) == length or (not answer.data and answer.error & self.form.refusals)
+                if fits and answer.servo_id == servo_id:
                     break
-                self._late += 1
+                # The answer of this servo is lost if the next one answers; any other answer is late.
+                self._late += not (fits and answer.servo_id in servo_ids[i + 1 :])
             if answer is None:
                 return None
             answers.append(answer)

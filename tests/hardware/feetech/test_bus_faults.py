@@ -85,3 +85,12 @@ def test_a_host_that_dies_while_its_cable_is_out_leaves_the_torque_on(serve, con
     robot.kill_host()
     assert STS.on(robot) == [1, 2, 3]
     assert "could NOT be confirmed" in robot.reports[0]
+
+
+def test_answers_behind_a_lost_one_are_not_late():
+    with STS.device(STS.robot(settings={"reply_loss": 0.1, "seed": 1})) as device:
+        for _ in range(50):
+            device.measure()
+        counters = device.counters
+    assert counters.lost_replies > 10
+    assert counters.late_replies == 0
