@@ -82,12 +82,10 @@ FAULTS = {
     "a process that was stopped": Fault(stall, SafetyStop, "guardian|stopped itself", SILENCE_S + 0.02),
 }
 WAYS = ("stop", "stop_quietly", "the end of the context")
-SLOW = ("silent motors", "answers that are damaged")
-"""Faults of which legs wait for seconds: the other ways out of them run at night."""
 CASES = [
     pytest.param(
         family, name, way, id=f"{name}-{family.name}-{way}",
-        marks=pytest.mark.night if family is LEGS and name in SLOW and way != "stop" else (),
+        marks=pytest.mark.night if family not in (VOLTS, BOARD) and way != "stop" else (),
     )
     for name, fault in FAULTS.items()
     for family in fault.families
