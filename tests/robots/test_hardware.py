@@ -139,7 +139,10 @@ def test_the_time_on_the_bus_is_part_of_every_step_that_uses_it(episodes):
             assert np.all(spent[: len(steps)] <= steps + 2e-6)
             assert found.nodes[name].bus.max == pytest.approx(spent.max())
         # An instruction of 17 bytes, three answers of 21, longer after a lost one, at 1 Mbaud; goals are not answered.
-        assert set(np.round(1e5 * found.bus_s["sensor"])) <= {17 + 3 * (21 + more) for more in range(4)}
+        # A lost answer is asked for again after 8 ms.
+        bytes_ = np.round(1e5 * found.bus_s["sensor"])
+        assert set(bytes_[bytes_ < 800]) <= {17 + 3 * (21 + more) for more in range(4)}
+        assert np.count_nonzero(bytes_ >= 800) <= 2
         assert found.nodes["agent"].bus.max is None
 
 
