@@ -34,11 +34,6 @@ class Groups:
     def __init__(self, apart: bool, by_tree: bool = False) -> None:
         self._apart, self._by_tree, self._belongs = apart, by_tree, np.zeros((0, 0), bool)
 
-    @property
-    def belongs(self) -> np.ndarray | None:
-        """Which residuals depend on each column, ``(n, F)``, bool; None before the first Jacobian, or if all may."""
-        return self._belongs if self._belongs.size else None
-
     def members(self, columns: Sequence[int]) -> list[list[int]]:
         """Return the groups of some columns; each alone before the first Jacobian is known."""
         if not self._belongs.size:
@@ -88,8 +83,7 @@ def trees_are_apart(model: MjModel | None) -> bool:
 class Nearby:
     """Residuals near a point, and their Jacobian, which is corrected after each step, and computed again if that fails.
 
-    Broyden's rank-one correction is exact along the last step (Math. Comp. 19, 1965). Where residuals depend on some
-    parameters alone, each is corrected in these (Schubert, Math. Comp. 24, 1970).
+    Broyden's rank-one correction is exact along the last step (Math. Comp. 19, 1965).
 
     Args:
         value: Residuals ``(N,)`` at a point ``(P,)``.
@@ -97,7 +91,6 @@ class Nearby:
         scale: Shape ``(P,)``: length of a step of each parameter that counts as much as one of another.
         known: A point nearby, the residuals and the Jacobian there, which is corrected for the first point, too.
         most: Most Jacobians that are computed; then each is corrected. Default: as many as needed.
-        groups: Of the columns, if the first ``fielded`` residuals are ``(..., F)``.
     """
 
     def __init__(
@@ -107,10 +100,7 @@ class Nearby:
         scale: np.ndarray | float = 1.0,
         known: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
         most: int | None = None,
-        groups: Groups | None = None,
-        fielded: int = 0,
     ) -> None:
-        self._groups, self._fielded = groups or Groups(False), fielded
         self._value, self._slope, self._scale = value, slope, scale
         self._last: tuple[np.ndarray, np.ndarray] | None = None  # the point of the last evaluation, and the residuals
         self._known, self._left, self._computed = known, np.inf if most is None else most, False
@@ -127,7 +117,7 @@ class Nearby:
             return self._known[2]
         r, J = self.residuals(y), None
         if self._known is not None:
-            J = self._updated(*self._known, y, r)
+            J = _updated(*self._known, y, r, self._scale, _TRUSTED if self._left > 0 else np.inf)
         self._computed = J is None
         self._known = (y.copy(), r, self._compute(y) if J is None else J)
         return self._known[2]
@@ -144,28 +134,24 @@ class Nearby:
         self._left -= 1
         return self._slope(y)
 
-    def _updated(
-        self, point: np.ndarray, before: np.ndarray, J: np.ndarray, y: np.ndarray, r: np.ndarray
-    ) -> np.ndarray | None:
-        """Return the corrected Jacobian after a step; None if the old one did not predict the step."""
-        step = y - point
-        expected = J @ step
-        missed = r - before - expected
-        direction = step / self._scale**2
-        length = float(step @ direction)
-        if length == 0.0:
-            return J
-        if self._left > 0 and not np.linalg.norm(missed) <= _TRUSTED * np.linalg.norm(expected):
-            return None
-        belongs, rows = self._groups.belongs, self._fielded
-        if belongs is None:
-            return J + np.outer(missed, direction / length)
-        J, fields = J.copy(), belongs.shape[1]
-        J[rows:] += np.outer(missed[rows:], direction / length)
-        by_field, missed_by_field = J[:rows].reshape(-1, fields, len(step)), missed[:rows].reshape(-1, fields)
-        for f in range(fields):
-            own = np.where(belongs[:, f], direction, 0.0)
-            if (length := float(step @ own)) > 0.0:
-                some = np.flatnonzero(own)
-                by_field[:, f, some] += np.outer(missed_by_field[:, f], own[some] / length)
+
+def _updated(
+    point: np.ndarray,
+    before: np.ndarray,
+    J: np.ndarray,
+    y: np.ndarray,
+    r: np.ndarray,
+    scale: np.ndarray | float,
+    trusted: float,
+) -> np.ndarray | None:
+    """Return the corrected Jacobian after a step; None if the old one did not predict the step."""
+    step = y - point
+    expected = J @ step
+    missed = r - before - expected
+    direction = step / scale**2
+    length = float(step @ direction)
+    if length == 0.0:
         return J
+    if not np.linalg.norm(missed) <= trusted * np.linalg.norm(expected):
+        return None
+    return J + np.outer(missed, direction / length)

@@ -282,8 +282,7 @@ class Problem:
             J = self._step_groups.spread(raw[1:] - raw[0], groups, len(y)) / (sign * self._step)
             return np.concatenate([J.reshape(-1, len(y)), self._prior_slope(y)])
 
-        fielded = len(part.live) * self.ts.shape[1] * len(self.fields)
-        return Nearby(value, slope, self.table.span, self._known_nearby(x, part), slopes, self._step_groups, fielded)
+        return Nearby(value, slope, self.table.span, self._known_nearby(x, part), slopes)
 
     def predict(self, values: Mapping[str, Any], segments: np.ndarray, fit_s: np.ndarray) -> np.ndarray:
         """Return the residuals of ``simulated``."""

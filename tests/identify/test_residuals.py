@@ -175,26 +175,6 @@ def test_a_jacobian_is_corrected_until_it_no_longer_predicts_the_step():
         computed.clear()
 
 
-def test_a_correction_keeps_residuals_apart_from_parameters_of_other_joints():
-    """Two joints, of which the first is curved; and a prior on the second."""
-    groups, a, b = Groups(apart=True), np.array([1.0, 2.0, 3.0]), np.array([1.0, -1.0, 2.0])
-
-    def value(y):
-        return np.append(np.stack([a * np.sin(y[0]), b * y[1]], axis=-1).ravel(), y[1])
-
-    def slope(y):
-        own = [np.stack([a * np.cos(y[0]), 0.0 * a], -1), np.stack([0.0 * b, b], -1)]
-        return np.vstack([groups.spread(np.stack(own), [[0], [1]], 2).reshape(-1, 2), [[0.0, 1.0]]])
-
-    there = Nearby(value, slope, most=1, groups=groups, fielded=6)
-    start, end = np.zeros(2), np.array([0.3, 1.0])
-    there.jacobian(start)
-    J = there.jacobian(end)
-    np.testing.assert_allclose(J @ (end - start), value(end) - value(start))  # exact along the step
-    np.testing.assert_allclose(J[:6].reshape(3, 2, 2)[:, 1], np.stack([0.0 * b, b], -1))
-    np.testing.assert_allclose(J[:6].reshape(3, 2, 2)[:, 0, 1], 0.0)
-
-
 def test_columns_of_separate_trees_are_moved_together():
     """Two legs of two joints each, of which the second moves with the first, and a delay of all."""
     J = np.zeros((3, 4, 5))
