@@ -209,16 +209,9 @@ class StateStream:
     def begin(self, timeout_s: float) -> LowState:
         """Wait for the first state that is intact, and return it."""
         with self._lock:
-            damaged, end_s = 0, self.robot.now_s() + timeout_s
-            while True:
-                left_s = end_s - self.robot.now_s()
-                state = self.robot.next_state(left_s) if left_s > 0.0 else None
-                if state is None:
-                    raise self._silent(timeout_s, damaged)
-                if state.intact:
-                    self._tick, self._taken_s = int(state.record["tick"]), self.robot.now_s()
-                    return state
-                damaged += 1
+            state = self._await(timeout_s, lambda state: state.intact)
+            self._tick, self._taken_s = int(state.record["tick"]), self.robot.now_s()
+            return state
 
     def next(self) -> tuple[LowState, Transaction]:
         """Return the first state that arrives after the call, and its times; raise HardwareLost if none does."""
@@ -228,15 +221,8 @@ class StateStream:
             begin_ns = self._clock.now_ns()
             while (old := self.robot.next_state(0.0)) is not None:
                 self._is_next(old)
-            lost, damaged, end_s = self._lost, 0, self.robot.now_s() + self._max_silence_s
-            while True:
-                left_s = end_s - self.robot.now_s()
-                state = self.robot.next_state(left_s) if left_s > 0.0 else None
-                if state is None:
-                    raise self._silent(self._max_silence_s, damaged)
-                if self._is_next(state):
-                    break
-                damaged += not state.intact
+            lost = self._lost
+            state = self._await(self._max_silence_s, self._is_next)
             # Count it.
             arrived_ns = self._clock.now_ns()
             retries, waited_s = self._lost - lost, 1e-9 * (arrived_ns - begin_ns)
@@ -252,6 +238,17 @@ class StateStream:
         """Return the counts, with those of the commands."""
         done = self._answered + commands
         return Counters(done, self._lost, self._retries, self._late, np.array(self._late_s))
+
+    def _await(self, longest_s: float, accepts: Callable[[LowState], bool]) -> LowState:
+        damaged, end_s = 0, self.robot.now_s() + longest_s
+        while True:
+            left_s = end_s - self.robot.now_s()
+            state = self.robot.next_state(left_s) if left_s > 0.0 else None
+            if state is None:
+                raise self._silent(longest_s, damaged)
+            if accepts(state):
+                return state
+            damaged += not state.intact
 
     def _is_next(self, state: LowState) -> bool:
         """Note a state; return whether it is intact and newer than the one before."""
