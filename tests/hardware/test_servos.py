@@ -304,7 +304,7 @@ def test_servos_that_do_not_fit_their_joints(change, joint, said):
     ("kind", "config", "joints", "message"),
     [
         (DynamixelServos, {"silence_s": 3.0}, (1,), "silence_s"),
-        (DynamixelServos, {"baud_rate": 1234}, (1,), r"baud rate 1234 .* Available: \[9600"),
+        (DynamixelServos, {"baud_rate": 1234}, (1,), r"baud rate 1234\. Available: \[9600"),
         (DynamixelServos, {}, (1, 254), "from 0 to 253"),
         (DynamixelServos, {}, (), "at least one"),
         (StsServos, {"baud_rate": 2_000_000}, (1,), "baud rate"),

@@ -138,7 +138,7 @@ class Servos(Device):
         halted: Whether torque stays off because `make_safe` or `close` was called.
 
     Raises:
-        UsageError: There are no joints, or two with one servo; or the family has not such a baud rate or watchdog.
+        UsageError: There are no joints, or two with one servo; or the family does not have such a baud rate or watchdog.
     """
 
     family: ClassVar[Family]
@@ -149,7 +149,7 @@ class Servos(Device):
         family, rates = self.family, self.family.baud_rates
         if config.baud_rate not in rates:
             raise UsageError(
-                f"baud rate {config.baud_rate} is none of a {family.name} servo's. Available: {sorted(rates)}"
+                f"{family.name} servos do not have the baud rate {config.baud_rate}. Available: {sorted(rates)}"
             )
         if config.silence_s > family.longest_silence_s:
             raise UsageError(f"silence_s = {config.silence_s} is outside [0, {family.longest_silence_s}]")

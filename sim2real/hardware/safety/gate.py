@@ -267,7 +267,7 @@ class SafetyGate:
             # The robot held its position meanwhile: a long pause must not allow a large jump.
             elapsed_s = min(elapsed_s, self.config.command_timeout_s)
         limit = np.asarray(self.config.slew_per_s, np.float64)
-        # Infinite times 0 s is no number, but no limit.
+        # Infinite times 0 s is NaN; it means no limit.
         largest = limit * elapsed_s if elapsed_s > 0.0 else np.where(np.isinf(limit), np.inf, 0.0)
         return np.clip(wanted, self._last - largest, self._last + largest)
 

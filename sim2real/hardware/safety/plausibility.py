@@ -22,7 +22,7 @@ def require_parts(parts: Mapping[str, np.ndarray], declared: Mapping[str, Readin
         if name not in parts or values.shape != part.shape:
             fault = f"has the shape {values.shape}" if name in parts else "is missing"
             raise SafetyStop(f"part {name!r} of the reading {fault}, declared is {part.shape}")
-        # A value that is no number is in no range.
+        # NaN is in no range.
         if not np.all((values >= part.low) & (values <= part.high)):
             raise SafetyStop(
                 f"part {name!r} of the reading is {values.tolist()} {part.unit}, not {part.low:g} to {part.high:g}",
@@ -104,7 +104,7 @@ class Plausibility:
         self._since_s, self._same = np.full(n, t_s), np.zeros(n, np.int64)
 
     def _require_finite(self, position_rad: np.ndarray) -> None:
-        """Refuse values that are no numbers, which pass every comparison."""
+        """Refuse NaN, which passes every comparison."""
         for i in np.flatnonzero(~np.isfinite(position_rad)):
             raise SafetyStop(
                 f"{self._config.joint(int(i))} reads {position_rad[i]} rad, which is not an angle",

@@ -375,7 +375,7 @@ class Rig:
         wanted, here = (values[:, goals[0]] if values.ndim > 1 else values for values in (command, position))
         away = np.abs(wanted - here)
         most = np.broadcast_to(np.asarray(self.gate.config.first_step_rad), away.shape)
-        if np.any(away > most):  # the gate refuses a command that is no number
+        if np.any(away > most):  # the gate refuses NaN
             worst = int(np.nanargmax(away - most))
             raise SafetyStop(
                 f"the first command puts {self.gate.config.joint(worst)} at {wanted[worst]:.3g} rad, measured are "

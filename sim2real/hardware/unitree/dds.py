@@ -66,7 +66,7 @@ class Address:
             interface, number = port, "0"
         if not (number.isdecimal() and int(number) <= _HIGHEST_DOMAIN):
             raise UsageError(
-                f"port {port!r}: {number!r} is no DDS domain, a number from 0 to {_HIGHEST_DOMAIN}",
+                f"port {port!r}: {number!r} is not a DDS domain, a number from 0 to {_HIGHEST_DOMAIN}",
                 hint="a port is INTERFACE:DOMAIN, such as eth0:0",
             )
         return cls(interface, int(number))

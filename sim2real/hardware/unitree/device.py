@@ -341,7 +341,7 @@ class UnitreeLegs(Device):
         motor, imu = record["motor_state"][self._places], record["imu_state"]
         position, velocity, load = (motor[name].astype(np.float64) for name in ("q", "dq", "tau_est"))
         if not np.isfinite(position + velocity).all():
-            raise SafetyStop("an angle or a speed in the robot's state is no number", hint="start the robot again")
+            raise SafetyStop("an angle or a speed in the robot's state is not a number", hint="start the robot again")
         parts = {
             "quaternion": imu["quaternion"],
             "gyro": imu["gyroscope"],
@@ -356,7 +356,7 @@ class UnitreeLegs(Device):
 
     def _require_possible(self, values: np.ndarray) -> None:
         low, high = self.reach()
-        bad = np.argwhere(~((values >= low) & (values <= high)))  # a value that is no number is in no range
+        bad = np.argwhere(~((values >= low) & (values <= high)))  # NaN is in no range
         if bad.size:
             row, column = bad[0].tolist()
             raise SafetyStop(

@@ -79,7 +79,7 @@ def crc32(record: np.ndarray) -> int:
 
 
 def _fields(name: str) -> list[tuple[str, str, int]]:
-    """Return the fields of a type: name, type, and number of values; 0: it is no array."""
+    """Return the fields of a type: name, type, and number of values; 0: it is not an array."""
     rows = [text.split() for text in _FIELDS[name].split(", ")]
     return [(field, kind.partition("*")[0], int(kind.partition("*")[2] or 0)) for field, kind in rows]
 
@@ -142,7 +142,7 @@ class _Record:
         wire, cut = bytes(data), cls._cut + 4
         mode, size = _aligned(cls._cut), cls.layout.itemsize
         if wire[:2] != _LITTLE_ENDIAN[:2] or len(wire) != size:
-            raise ValueError(f"{len(wire)} bytes that begin with {wire[:2].hex()} are no {cls.__name__} in XCDR1")
+            raise ValueError(f"{len(wire)} bytes that begin with {wire[:2].hex()} are not a {cls.__name__} in XCDR1")
         raw = b"".join((wire[4:cut], bytes(mode - cls._cut), wire[cut : cut + 1], bytes(3), wire[_aligned(cut + 1) :]))
         # The CRC covers padding as zeros, also where the sender has other values.
         return cls((np.frombuffer(raw, np.uint8) & cls._content).view(cls.layout).reshape(()))

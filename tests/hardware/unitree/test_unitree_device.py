@@ -155,7 +155,7 @@ def test_a_robot_that_was_left_on_is_laid_down_first(robot, device, other):
 
 
 @pytest.mark.parametrize(
-    ("port", "words"), [("eth0:233", "'233' is no DDS domain"), ("eth0:x", "'x' is no DDS domain")]
+    ("port", "words"), [("eth0:233", "'233' is not a DDS domain"), ("eth0:x", "'x' is not a DDS domain")]
 )
 def test_a_port_without_a_domain_is_refused(port, words):
     with pytest.raises(UsageError, match=words):
