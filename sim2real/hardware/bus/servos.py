@@ -138,7 +138,7 @@ class Servos(Device):
         halted: Whether torque stays off because `make_safe` or `close` was called.
 
     Raises:
-        UsageError: There are no joints, or two with one servo; or the family does not have such a baud rate or watchdog.
+        UsageError: There are no joints, or two with one servo; or the family lacks that baud rate or watchdog.
     """
 
     family: ClassVar[Family]

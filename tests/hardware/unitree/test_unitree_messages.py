@@ -88,7 +88,7 @@ def test_an_empty_command_has_unitrees_crc():
 
 @pytest.mark.parametrize("wire", [b"", LowCmd().to_wire()[:-4], b"\x00\x07" + LowCmd().to_wire()[2:]])
 def test_bytes_of_another_message_are_refused(wire):
-    with pytest.raises(ValueError, match="no LowCmd in XCDR1"):
+    with pytest.raises(ValueError, match="not a LowCmd in XCDR1"):
         LowCmd.from_wire(wire)
 
 
