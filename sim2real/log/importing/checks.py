@@ -107,12 +107,15 @@ def check(
     if found is None:
         text = "the stamps of goals and positions overlap in fewer than 50 samples: nothing is checked"
         return [Check("overlap", -1, text, "refuse")]
-    judged = [_judge(found, i, names, by_name, t_s, goal, position) for i in range(len(names))]
-    findings = [wrong for wrong, _, _ in judged if wrong is not None]
-    following = [i for i, (wrong, _, _) in enumerate(judged) if wrong is None]
-    moving = [i for i, (_, moves, _) in enumerate(judged) if moves]
+    after_s = -1.5 * found.sample_s
+    fits = found.fit(1.0, after_s), found.fit(-1.0, after_s), found.fit(1.0, _LAGS_S[0])
+    judged = [_judge(found, fits, i, names, by_name, t_s, goal, position) for i in range(len(names))]
+    findings = [wrong for wrong, _ in judged if wrong is not None]
+    following = [i for i, (wrong, _) in enumerate(judged) if wrong is None]
+    moving = [i for i, (_, moves) in enumerate(judged) if moves]
+    lag_s = np.diag(fits[0].lag_s).tolist()
     opposed = {f.joint for f in findings if f.weight == "refuse" and f.name in ("sign", "order")}
-    begin_s = {i: judged[i][2] if i in following else None for i in following or moving if i not in opposed}
+    begin_s = {i: lag_s[i] if i in following else None for i in following or moving if i not in opposed}
     clock = _clock(t_s, goal, position, begin_s, acting)
     rates = _rates(t_s, goal[:, moving], position[:, moving]) if moving else []
     if any(f.weight == "refuse" for f in clock):
@@ -124,13 +127,13 @@ def check(
         findings.append(Check("follows", -1, text, "ask"))
     findings += clock
     if following:
-        late = ", ".join(f"{names[i]} {1e3 * judged[i][2]:.0f} ms" for i in following[:6])
+        late = ", ".join(f"{names[i]} {1e3 * lag_s[i]:.0f} ms" for i in following[:6])
         text = f"positions follow their goals: {late}" + " ..." * (len(following) > 6)
         findings.append(Check("follows", -1, text, "note"))
     if not any(f.weight == "refuse" for f in findings):
         for i in moving:
-            lag_s = judged[i][2] if i in following else None
-            findings += _zero(t_s, goal[:, i], position[:, i], i, names[i], lag_s)
+            known_s = lag_s[i] if i in following else None
+            findings += _zero(t_s, goal[:, i], position[:, i], i, names[i], known_s)
     return [*findings, *rates, *odd_columns(position, names)]
 
 
@@ -172,18 +175,24 @@ class Response(NamedTuple):
     spread: tuple[np.ndarray, np.ndarray]
     sample_s: float  # time between samples of the faster side
 
-    def best(self, joint: int, command: int, sign: float, begin_s: float) -> tuple[float, float, float]:
-        """Return correlation, lag [s] and slope of the best lag from a begin on, with a sign of the correlation."""
+    def fit(self, sign: float, begin_s: float) -> Fit:
+        """Return how each position fits each command, or its opposite, at the best lag from a begin on."""
         rows = np.flatnonzero(self.lag_s >= begin_s)
-        k = rows[np.argmax(sign * self.r[rows, joint, command])]
-        return float(self.r[k, joint, command]), float(self.lag_s[k]), float(self.slope[k, joint, command])
+        k = rows[np.argmax(sign * self.r[rows], axis=0)]
+        r, slope = (np.take_along_axis(x, k[None], axis=0)[0] for x in (self.r, self.slope))
+        spread = np.maximum(self.spread[1], 1e-9)[:, None]
+        size, level = self.spread[0] / spread, (self.mean[1][:, None] - sign * self.mean[0]) / spread
+        misfit = np.sqrt(np.maximum(1 + size**2 - 2 * sign * r * size, 0.0) + level**2)
+        return Fit(r, self.lag_s[k], slope, misfit)
 
-    def misfit(self, joint: int, command: int, sign: float, r: float) -> float:
-        """Return the error of a command, or of its opposite, as a prediction, over the spread of the position."""
-        spread = max(self.spread[1][joint], 1e-9)
-        size = self.spread[0][command] / spread
-        level = (self.mean[1][joint] - sign * self.mean[0][command]) / spread
-        return float(np.sqrt(max(1 + size**2 - 2 * sign * r * size, 0.0) + level**2))
+
+class Fit(NamedTuple):
+    """How each position fits each command at one lag; shape ``(joints, commands)``."""
+
+    r: np.ndarray  # correlation
+    lag_s: np.ndarray
+    slope: np.ndarray  # of positions over commands
+    misfit: np.ndarray  # error of the command as a prediction, over the spread of the position
 
 
 def respond(
@@ -224,42 +233,41 @@ def respond(
     return Response(lags * period_s, r, cov / vx[:, None, :], (mean[0], mean[1]), (spread[0], spread[1]), sample_s)
 
 
-def _judge(found: Response, i: int, names: Sequence[str], by_name: bool, t_s: tuple[np.ndarray, np.ndarray],
-           goal: np.ndarray, position: np.ndarray) -> tuple[Check | None, bool, float]:  # fmt: skip
-    """Return what a joint's goals and positions contradict, None if it follows; whether it moves; and its lag [s]."""
-    name, begin_s = names[i], -1.5 * found.sample_s
+def _judge(
+    found: Response, fits: tuple[Fit, Fit, Fit], i: int, names: Sequence[str], by_name: bool,
+    t_s: tuple[np.ndarray, np.ndarray], goal: np.ndarray, position: np.ndarray,
+) -> tuple[Check | None, bool]:  # fmt: skip
+    """Return what a joint's goals and positions contradict, None if it follows; and whether it moves.
+
+    Args:
+        fits: To goals, and to their opposites, at lags after them; to goals, also at lags before them.
+    """
+    name, (own, opposite, leading) = names[i], fits
     moves = bool(min(s[i] for s in found.spread) > _STILL)
     # A joint that is held: where, and by which goal. A weak servo sags, by less than half of its goal.
     level, held = float(np.median(position[:, i])), float(np.median(goal[:, i]))
     is_elsewhere = (
         not moves and np.ptp(goal[:, i]) < 4 * _STILL and abs(held) > 0.1 and abs(level - held) > abs(held) / 2
     )
-    # Its own goal, or the opposite, at the best lag after it; and at the best lag of all, also before it.
-    r, lag_s, slope = found.best(i, i, 1.0, begin_s)
-    against, _, mirrored = found.best(i, i, -1.0, begin_s)
-    lead_r, lead_s, _ = found.best(i, i, 1.0, _LAGS_S[0])
-    best, slope = max(r, -against), slope if r > -against else -mirrored
-    misfit, mirror = found.misfit(i, i, 1.0, r), found.misfit(i, i, -1.0, against)
+    r, against = float(own.r[i, i]), float(opposite.r[i, i])
+    best, slope = max(r, -against), float(own.slope[i, i] if r > -against else -opposite.slope[i, i])
+    misfit, mirror = float(own.misfit[i, i]), float(opposite.misfit[i, i])
     # The sign is 0 if both fit: a tone half a period later is its opposite.
     sign = _is_clear(r, -against, misfit, mirror) - _is_clear(-against, r, mirror, misfit)
+    lead_r, lead_s = float(leading.r[i, i]), float(leading.lag_s[i, i])
     leads = lead_r > 0.9
     if best >= _FOLLOWS_R:
         leads = -lead_s > 1.5 * found.sample_s and 1 - r > 3 * (1 - lead_r) + 0.005
     # The goals of other joints, apart from those that equal its own, or its opposite.
-    others: list[tuple[float, int]] = []
-    rivals: list[tuple[int, float]] = []
-    for j in range(len(names) if moves else 0):
-        if j == i or any(np.allclose(goal[:, i], s * goal[:, j], 1e-6, 1e-9) for s in (1, -1)):
-            continue
-        fits = [(found.best(i, j, sign, begin_s)[0], sign) for sign in (1.0, -1.0)]
-        other_r = max(abs(r) for r, _ in fits)
-        others.append((other_r, j))
-        its = min(found.misfit(i, j, sign, r) for r, sign in fits)
-        by_level = min(misfit, mirror) < 0.5 * its and its > 0.1
-        if not by_level and (1 - other_r <= 3 * (1 - best) + 0.02 or other_r > best + 0.02):
-            rivals.append((j, other_r))
-    other_r, other = max(others, default=(0.0, i))
-    rival, rival_r = rivals[0] if rivals and not by_name and max(best, other_r) >= _FOLLOWS_R else (-1, 0.0)
+    mine = goal[:, i : i + 1]
+    unlike = moves & ~np.any([np.isclose(mine, s * goal, 1e-6, 1e-9).all(axis=0) for s in (1, -1)], axis=0)
+    others = np.where(unlike, np.maximum(own.r[i], -opposite.r[i]), 0.0)
+    other, other_r = int(np.argmax(others)), float(others.max())
+    theirs = np.minimum(own.misfit[i], opposite.misfit[i])
+    by_level = (min(misfit, mirror) < 0.5 * theirs) & (theirs > 0.1)
+    alike = unlike & ~by_level & ((1 - others <= 3 * (1 - best) + 0.02) | (others > best + 0.02))
+    is_unclear = not by_name and bool(alike.any()) and max(best, other_r) >= _FOLLOWS_R
+    rival = int(np.argmax(alike))
     copied = moves and lead_r > 0.95 and is_copy(t_s, goal[:, i], position[:, i], lead_s)
     away = f"{name} is held at {level:.3g} by a goal of {held:.3g}: another sign, unit or zero"
     scale = f"{name} follows its goal (r {r:.2f}) with a slope of {slope:.3g}: unit or scale of one of them is wrong"
@@ -272,8 +280,8 @@ def _judge(found: Response, i: int, names: Sequence[str], by_name: bool, t_s: tu
         ("still", "warn", not moves, f"{name} hardly moves: sign, order and unit are not checked"),
         ("order", "refuse", other_r > 0.9 and best < 0.6,
          f"{name} follows the goal of {names[other]} (r {other_r:.2f}), not its own (r {best:.2f})"),
-        ("order", "ask", rival >= 0,
-         f"{name} follows its own goal and that of {names[rival]} alike (r {best:.2f} and {rival_r:.2f})"),
+        ("order", "ask", is_unclear,
+         f"{name} follows its own goal and that of {names[rival]} alike (r {best:.2f} and {others[rival]:.2f})"),
         ("lag", "refuse", best < _FOLLOWS_R and leads, before),
         ("follows", "warn", best < _FOLLOWS_R,
          f"{name} does not follow its goal (r {best:.2f} at most): sign, unit and order are not checked"),
@@ -286,7 +294,7 @@ def _judge(found: Response, i: int, names: Sequence[str], by_name: bool, t_s: tu
          "the motion repeats"),
     ]  # fmt: skip
     wrong = next((Check(name, i, text, weight) for name, weight, holds, text in table if holds), None)
-    return wrong, moves, lag_s
+    return wrong, moves
 
 
 def _is_clear(r: float, other_r: float, misfit: float, other_misfit: float) -> bool:
