@@ -74,6 +74,8 @@ def test_goals_that_are_copies_are_refused(shift):
 @pytest.mark.parametrize(("rate", "weight"), [(0.98, "refuse"), (1.02, "refuse"), (1.004, "warn"), (0.996, "warn")])
 def test_a_clock_of_another_rate_is_found(rate, weight):
     assert ("clock", -1, weight) in findings(t_q=T * rate)
+    half = slice(len(T) // 2)
+    assert "clock" in {f[0] for f in findings(GOAL[half], Q[half], T[half], T[half] * rate)}
 
 
 @pytest.mark.parametrize("rate", [0.98, 1.02])

@@ -358,7 +358,7 @@ def _clock(
     )
     grown = rate * (end - begin)
     period_s = max(float(np.median(np.diff(t))) for t in t_s)
-    if abs(grown) < max(0.02, 2.5 * period_s) or rest.std() > 0.15 * abs(grown) or fixed < 2 * best + 1e-4:
+    if abs(grown) < max(0.02, period_s) or rest.std() > 0.15 * abs(grown) or fixed < 1.5 * best + 1e-4:
         return []
     text = (
         f"the lag of positions behind goals grows by {1e3 * rate:.1f} ms each second ({1e3 * grown:.0f} ms in all): "
