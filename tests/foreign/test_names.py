@@ -8,7 +8,7 @@ from foreign_robots import MODEL, VENDOR, csv, imported, motion, proposed
 
 from sim2real import cli
 from sim2real.errors import UsageError
-from sim2real.log import load_mapping, read_log
+from sim2real.log import import_file, load_mapping, read_log
 from sim2real.log.importing.names import columns_of, is_unit, meaning
 from sim2real.log.importing.propose import ImportHints, propose
 from sim2real.log.importing.readers import joined, open_tables
@@ -97,6 +97,18 @@ def test_a_vendors_names_are_matched_by_leg_and_number(tmp_path):
 def test_names_match_or_they_do_not(labels, joints, places):
     found = columns_of(joints, tuple(x.lower() for x in labels))
     assert (found and found[0]) == places
+
+
+def test_columns_of_a_floating_base_before_those_of_the_joints_are_asked(tmp_path):
+    qpos = np.column_stack([np.zeros((len(T), 7)), Q])
+    np.savez(tmp_path / "run.npz", time=T, ctrl=GOAL, qpos=qpos)
+    found = proposed(tmp_path / "run.npz", joints=("hip", "knee"))
+    ((at, question),) = found.questions.items()
+    assert (at, question.partition(" or ")[0]) == (("sensor", "position", "source"), '"qpos[:,7:9]"')
+    answered = re.sub(r"^# source = (\S+) or .*$", r"source = \1", found.toml(), flags=re.MULTILINE)
+    (tmp_path / "import.toml").write_text(answered)
+    episode = import_file(tmp_path / "run.npz", tmp_path / "import.toml")
+    np.testing.assert_array_equal(episode.outputs["sensor"]["position"], Q)
 
 
 @pytest.mark.parametrize("nameless", [False, True])

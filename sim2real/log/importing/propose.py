@@ -56,6 +56,8 @@ _RATES_HZ = (5.0, 12_000.0)
 """Usual sampling rates of recorders."""
 _WALL_S = (1e9, 4e9)
 """Wall clocks read this many seconds since 1970 (2001 to 2096)."""
+_FLOATING = 7
+"""Columns of a floating base before those of the joints: its position, and its orientation as a quaternion."""
 _APART_S = 0.02
 """Two clocks of one topic that disagree by more are a question."""
 
@@ -236,6 +238,13 @@ class Proposal:
                 self.evidence.append(f"joints {found[1]}: {pairs}")
             return places, joints
         named = any(labels) and not are_numbers(labels)
+        if not named and measured.whole and measured.width == len(joints) + _FLOATING:
+            source = f"{measured.whole}[:,{_FLOATING}:{measured.width}]"
+            self.questions[at] = (
+                f"{json.dumps(source)} or other columns?  # {measured.width} columns for {len(joints)} joints: 7 more, "
+                "as of a floating base"
+            )
+            return list(range(_FLOATING, measured.width)), joints
         if (named and not self.hints.as_told) or len(joints) != measured.width:
             raise UsageError(
                 f"the {measured.width} columns of {measured.name!r} in {self.table.path} "
