@@ -156,6 +156,9 @@ def test_one_column_of_another_scale_is_refused_by_name(tmp_path):
         proposed(tmp_path / "run.npz")
     _, found = imported(tmp_path / "run.npz", joints=("arm",))
     assert found.joints == ("arm",)
+    np.savez(tmp_path / "run.npz", time=T, ctrl=GOAL * [1, 255], qpos=Q * [1, 255], joint_names=names)
+    (question,) = proposed(tmp_path / "run.npz").questions.values()
+    assert "finger reads up to" in question
 
 
 def test_stamps_units_and_rates(tmp_path):

@@ -36,6 +36,7 @@ def read(path, text):
         ("t,q\n0,null\n1,2\n", {"t": [0, 1], "q": [np.nan, 2]}),
         ("t,on\n0,true\n1,False\n", {"t": [0, 1], "on": [1, 0]}),
         ("\ufefft,q\r\n0,1\r\n1,2\r\n", {"t": [0, 1], "q": [1, 2]}),
+        ("t;q [\N{DEGREE SIGN}]\n0;1,5\n1;2,5\n".encode("cp1252"), {"q [\N{DEGREE SIGN}]": [1.5, 2.5]}),
         ('"t, s","q"\n0,1\n1,2\n', {"t, s": [0, 1], "q": [1, 2]}),
         ("0.5,1\n1.5,2\n", {"0": [0.5, 1.5], "1": [1, 2]}),
         ("t,q\n0,1\n1,2\n2,3", {"t": [0, 1], "q": [1, 2]}),  # 3 may be the beginning of 3.7
