@@ -79,7 +79,7 @@ def test_a_clock_that_starts_elsewhere_is_moved_to_0_and_said_so(tmp_path, begin
     episode = import_file(file, wanted)
     np.testing.assert_array_equal(episode.steps["sensor"].start, STAMPS_US - STAMPS_US[0])
     assert episode.metadata["source"]["time_zero_us"] == begin_ns // 1000 + STAMPS_US[0]
-    write_log(tmp_path / "run.mcap", episode, wanted)
+    write_log(tmp_path / "run.mcap", episode)
     is_wall_clock = begin_ns > 1e18
     assert summary(tmp_path / "run.mcap")["epoch_ns"] == (begin_ns + 1000 * STAMPS_US[0] if is_wall_clock else 0)
 
@@ -153,7 +153,7 @@ def test_turns_are_counted_and_said(tmp_path, unit):
 
 def test_the_log_reads_back_as_the_episode(file, tmp_path):
     episode = import_file(file, mapping())
-    write_log(tmp_path / "run.mcap", episode, mapping())
+    write_log(tmp_path / "run.mcap", episode)
     back = read_log(tmp_path / "run.mcap")
     assert back.complete
     assert not back.messages
@@ -175,14 +175,12 @@ def test_the_log_reads_back_as_the_episode(file, tmp_path):
     assert not timeline.edges
 
 
-@pytest.mark.parametrize(("order", "first"), [(None, "/sensor/output"), (-1, "/actuator/output")])
-def test_commands_are_sent_after_the_sample_of_their_stamp_unless_told_otherwise(file, tmp_path, order, first):
-    wanted = mapping(actuator={"order": order})
-    write_log(tmp_path / "run.mcap", import_file(file, wanted), wanted)
+def test_commands_are_written_after_the_sample_of_their_stamp(file, tmp_path):
+    write_log(tmp_path / "run.mcap", import_file(file, mapping()))
     with open(tmp_path / "run.mcap", "rb") as stream:
         found = [(c.topic, m.log_time) for _, c, m in make_reader(stream).iter_messages(log_time_order=False)]
-    assert found[0] == (first, 1000 * STAMPS_US[0])
-    assert [topic for topic, _ in found[::4]] == [first] * COUNT
+    assert found[0] == ("/sensor/output", 1000 * STAMPS_US[0])
+    assert [topic for topic, _ in found[::4]] == ["/sensor/output"] * COUNT
 
 
 def test_identification_takes_the_log(file, tmp_path, recwarn):
@@ -191,7 +189,7 @@ def test_identification_takes_the_log(file, tmp_path, recwarn):
 
     robot = copy.copy(load_robot("disk"))
     robot.name, robot.units = "rig", {}
-    write_log(tmp_path / "run.mcap", import_file(file, mapping()), mapping())
+    write_log(tmp_path / "run.mcap", import_file(file, mapping()))
     episode = open_recording(tmp_path / "run.mcap", robot).episode
     assert len(episode.steps["sensor"]) == COUNT
     assert not recwarn.list
@@ -201,14 +199,14 @@ def test_identification_takes_the_log(file, tmp_path, recwarn):
 
 def test_a_log_is_never_overwritten_and_a_failed_one_not_left(file, tmp_path):
     episode = import_file(file, mapping())
-    write_log(tmp_path / "run.mcap", episode, mapping())
+    write_log(tmp_path / "run.mcap", episode)
     before = (tmp_path / "run.mcap").read_bytes()
     with pytest.raises(Sim2RealError, match="exists already"):
-        write_log(tmp_path / "run.mcap", episode, mapping())
+        write_log(tmp_path / "run.mcap", episode)
     assert (tmp_path / "run.mcap").read_bytes() == before
     episode.outputs["sensor"]["q"] = episode.outputs["sensor"]["q"][:20]
     with pytest.raises(IndexError):
-        write_log(tmp_path / "other.mcap", episode, mapping())
+        write_log(tmp_path / "other.mcap", episode)
     assert not (tmp_path / "other.mcap").exists()
 
 
@@ -319,7 +317,7 @@ def test_mapping_files_that_are_none(tmp_path, text, pipeline, named):
 
 
 def test_units_stand_in_the_channels(file, tmp_path):
-    write_log(tmp_path / "run.mcap", import_file(file, mapping()), mapping())
+    write_log(tmp_path / "run.mcap", import_file(file, mapping()))
     with open(tmp_path / "run.mcap", "rb") as stream:
         found = make_reader(stream).get_summary()
     channels = {c.topic: c for c in found.channels.values()}

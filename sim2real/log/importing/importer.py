@@ -105,16 +105,15 @@ def import_table(table: Table, mapping: ImportMapping, samples: slice | None = N
     )
 
 
-def write_log(path: str | Path, episode: Episode, mapping: ImportMapping) -> None:
+def write_log(path: str | Path, episode: Episode) -> None:
     """Write an imported episode as a log.
 
-    Steps with the same stamp are written in the order that the mapping gives to nodes. The log's time 0 is 1970 on the
-    wall clock unless the file's stamps come from a wall clock.
+    Of steps with the same stamp, commands come last. The log's time 0 is 1970 on the wall clock unless the file's
+    stamps come from a wall clock.
 
     Args:
         path: The log; it must not exist.
         episode: The result of ``import_file``.
-        mapping: The mapping of the import.
 
     Raises:
         Sim2RealError: When the log exists or cannot be written, or names collide.
@@ -128,10 +127,9 @@ def write_log(path: str | Path, episode: Episode, mapping: ImportMapping) -> Non
         counts = [len(episode.steps[n]) for n in names]
         seq = np.concatenate([np.arange(n) for n in counts])
         node = np.repeat(np.arange(len(names)), counts)
-        order = [mapping.nodes[n].order for n in names]
-        order = np.repeat([int(n == "actuator") if k is None else k for n, k in zip(names, order, strict=True)], counts)
+        answers = np.repeat([n == "actuator" for n in names], counts)
         ticks = np.concatenate([episode.steps[n].start for n in names])
-        for row in np.lexsort((node, order, ticks)).tolist():
+        for row in np.lexsort((node, answers, ticks)).tolist():
             name, k, tick = names[node[row]], int(seq[row]), int(ticks[row])
             record = StepRecord(name, k, tick, tick, tick, -1, tick, 0)
             file.step(record, [values[k] for values in episode.outputs[name].values()])

@@ -89,8 +89,6 @@ class NodeMapping(_Table, frozen=True):
         rate_hz: Rate of generated time stamps [Hz]; None: use ``stamps``.
         stamps: Signal with the recorded time stamps; None: use ``rate_hz``.
         stamp_unit: Unit of the recorded stamps.
-        order: Order of messages with equal stamps: those of nodes with a lower number are first; None: commands
-            (of a node ``actuator``) come after samples, as they were computed from them.
         stamp_offset: Added to the recorded stamps, for a stream with its own clock [s].
     """
 
@@ -98,7 +96,6 @@ class NodeMapping(_Table, frozen=True):
     rate_hz: float | None = None
     stamps: str | None = None
     stamp_unit: Literal["s", "ms", "us", "ns"] = "s"
-    order: int | None = None
     stamp_offset: float = 0.0
 
     def __post_init__(self) -> None:

@@ -56,7 +56,7 @@ def run(config: ImportConfig) -> None:
         # Write the logs, with the proposed mapping beside them.
         written = None
         if config.out is not None:
-            importer.write_log(config.out, episodes[0], mapping)
+            importer.write_log(config.out, episodes[0])
             print(pairs(importer.facts(episodes[0])))
             wrote(config.out)
             if text:
@@ -68,7 +68,7 @@ def run(config: ImportConfig) -> None:
             with run_folder.open_stage(config.runs, mapping.pipeline, "record", config, inputs) as stage:
                 for i, episode in enumerate(episodes):
                     log = stage.output("log" if not i else f"log_{i}", f"session{f'_{i}' if i else ''}.mcap")
-                    importer.write_log(log, episode, mapping)
+                    importer.write_log(log, episode)
                     print(pairs(importer.facts(episode)))
                     wrote(log)
                 if text:
