@@ -144,8 +144,8 @@ def turned_gravity(problem: Problem, values: Mapping[str, float]) -> tuple[float
     table = problem.table
     estimate = table.encode({**{p.name: p.without for p in table}, **values})
     columns = np.array([c.term == TILT for c in table.columns])
-    # Nothing is searched for unless a small turn would help, by linear algebra.
-    if not _promises(problem.linearise(estimate), columns):
+    # Nothing is searched for unless a small turn would help, by linear algebra, or half a turn, as of a ceiling.
+    if not (_promises(problem.linearise(estimate), columns) or _half_turn_helps(problem, estimate, columns)):
         return None
     starts = []
     for x in (estimate, table.start()):
@@ -171,6 +171,13 @@ def _promises(at: Linearised, columns: np.ndarray) -> bool:
     left = [np.linalg.norm(r - J[:, which] @ np.linalg.lstsq(J[:, which], r, rcond=None)[0]) for which in (
         ~columns, np.ones_like(columns))]  # fmt: skip
     return bool(left[1] < _PROMISING * left[0])
+
+
+def _half_turn_helps(problem: Problem, x: np.ndarray, columns: np.ndarray) -> bool:
+    """Return whether half a turn about one of the axes lowers the loss; its derivative at no turn is 0."""
+    turned = x + math.pi * np.eye(len(x))[columns]
+    straight, *others = problem.losses(np.concatenate([x[None], problem.table.within(turned)]), x)
+    return bool(np.nan_to_num(others, nan=np.inf).min() < _PROMISING**2 * straight)
 
 
 def largest_residual(
