@@ -140,7 +140,7 @@ def _message(process: subprocess.Popen[str], wait_s: float) -> Mapping[str, Json
 
 def main() -> None:
     """Follow the folder that the first line of the standard input names."""
-    from sim2real.view.live.follower import PERIOD_S, Follower  # needs matplotlib, which a robot's computer lacks
+    from sim2real.view.live import PERIOD_S, Follower  # needs matplotlib, which a robot's computer lacks
 
     # The viewer inherits the priority: every other program comes first. Only Linux has the second one.
     with suppress(OSError):
@@ -177,7 +177,7 @@ def follow(run_dir: Path, name: str, target: str, scene: Scene | None) -> None:
     Raises:
         Sim2RealError: The viewer does not start.
     """
-    from sim2real.view.live.follower import PERIOD_S, Follower
+    from sim2real.view.live import PERIOD_S, Follower
 
     recording = rerun_module().RecordingStream(f"sim2real {name}")
     note(f"view: {open_viewer(recording, target)}")

@@ -12,8 +12,7 @@ from sim2real.artifacts.progress import PROGRESS, write_progress
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode, Steps
 from sim2real.stages import live
-from sim2real.view.live.follower import Follower, ProgressSource
-from sim2real.view.live.log_source import LogSource, _thinned
+from sim2real.view.live import Follower, LogSource, ProgressSource, _thinned
 from sim2real.view.model_scene import ModelScene
 
 rr = pytest.importorskip("rerun")
