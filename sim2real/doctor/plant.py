@@ -42,7 +42,7 @@ class _Part(Suspect):
         usual: The model's value.
         is_off: Whether a value may be a fault.
         drop: Share of the error without it by which it must lower it to be a fault.
-        of: Whether it is a number of ``all`` joints, of ``one`` of them, of all or ``one too``, of ``some``, or of all
+        of: Whether it is a number of ``all`` joints, of ``one`` of them, of all or ``one too``, of ``each``, or of all
             and estimated ``with the rest``.
     """
 
@@ -77,15 +77,15 @@ _PARTS = {part.names[0]: part for part in (
           is_off=lambda f: f > 0.2),
     # A limit above three quarters of the model's is none: drives that lag look limited a little earlier.
     _Part("torque limit", ("limit",), "torque is clipped: {value}", (0.05, 0.08, 0.12, 0.17, 0.24, 0.33, 0.45, 0.6),
-          lambda f: f * np.array((0.87, 0.93, 1.07, 1.15)), usual=np.inf, is_off=lambda f: f < 0.75, least=0.12,
-          drop=0.17, of="some"),
+          lambda f: np.outer((0.87, 0.93, 1.07, 1.15), f), usual=np.inf, is_off=lambda f: f < 0.75, least=0.12,
+          drop=0.17, of="each"),
     _Part("damping", ("kd",), "{who}: {value:.2f} times the contract's damping", (1.0, 0.2, 0.4, 2.5),
           lambda f: f * np.array((0.8, 1.25)), usual=1.0, is_off=lambda f: not 0.5 <= f <= 2.0, of="with the rest"),
 )}  # fmt: skip
 """Name in a setting -> what it is: factors of the contract's gains, shares of the largest torque asked for (friction,
 limit), of the joint's inertia (armature) and of the robot's mass (payload), an angle [rad], and a share of the gains
-(fade); ``NAME JOINT`` is that of one joint. ``kd`` and ``delay_s``, from a target in the log to the motion [s], are
-estimated with anything else."""
+(fade). ``NAME JOINT`` is that of one joint; a limit has a number for each. ``kd``, and ``delay_s`` from a target in the
+log to the motion [s], are estimated with anything else."""
 _DELAY = Suspect("delay", ("delay_s",), "", (0.0, 0.007, 0.014, 0.021, 0.028, 0.035, 0.045, 0.06),
                  lambda s: np.maximum(0.0, s + np.array((-0.005, -0.0015, 0.0015, 0.005))))  # fmt: skip
 _NUISANCE = (_DELAY.move, _PARTS["kd"].move)
@@ -190,7 +190,7 @@ class Drives:
         if not self.torque_driven:
             model.actuator_biasprm[:, 0] = -kp * each("zero", 0.0)
             model.actuator_biasprm[:, 1], model.actuator_biasprm[:, 2] = -kp, -self.kd * plant.get("kd")
-        limit = np.minimum(self.limit, asked * each("limit", np.inf) * left)
+        limit = np.minimum(self.limit, asked * np.array(plant.get("limit", np.inf)) * left)
         model.actuator_forcerange[:, 0], model.actuator_forcerange[:, 1] = -limit, limit
         friction = (plant.get("friction", 0.0) + each("friction", 0.0)) * asked
         model.dof_frictionloss[self.dof] = np.maximum(0.0, model.dof_frictionloss[self.dof] + friction)
@@ -345,18 +345,27 @@ class Replay:
                     yield from part.of_joint("").candidates(start, *_NUISANCE)
                 if part.of == "one" or (part.of == "one too" and len(self.scale) > 1 and start is plant):
                     yield from self._of_one(name, start)
-                if part.of == "some" and not self._of_joints(name, plant):
-                    yield self._of_some(name, start)
+                if part.of == "each" and name not in plant:
+                    yield self._of_each(part, start)
 
-    def _of_some(self, name: str, start: Setting) -> Candidate:
-        """Return a part of the joints that move better with it, each with its own value."""
-        part, joints = _PARTS[name], self.drives.joints
+    def _of_each(self, part: _Part, start: Setting) -> Candidate:
+        """Return a part with a number for each joint; a joint has one only if that explains a tenth of its error."""
+        name = part.names[0]
+        of = lambda plant: np.broadcast_to(plant.get(name, part.usual), len(self.scale))  # noqa: E731
+
+        def mixed(plants: Sequence[Setting]) -> Setting:
+            """Return the first plant, in which each joint has the number of the plant in which it moves best."""
+            numbers = np.array([of(p) for p in plants])
+            errors = np.array([self.errors(p) for p in plants]) * np.where(numbers == part.usual, 0.9, 1.0)
+            best = np.take_along_axis(numbers, errors.argmin(0)[None], 0)[0]
+            return plants[0].having({name: tuple(best.tolist())} if (best != part.usual).any() else {})
+
         # Other gains of one joint, which are no fault, look like its limit.
         others = [start.having({"kp": p * start.get("kp"), "kd": d * start.get("kd")})
                   for p, d in ((0.85, 1.0), (1.18, 1.0), (1.0, 0.7), (1.0, 1.4))]  # fmt: skip
-        tried = [start, *(start.having({f"{name} {j}": v for j in joints}) for v in part.grid), *others]
-        near = lambda at: [self._mixed([at, *self._near(at, name)], name)]  # noqa: E731
-        return Candidate(part.fault, self._mixed(tried, name), lambda _: "", (near, *_NUISANCE), part.least)
+        tried = [start, *(start.having({name: (v,) * len(self.scale)}) for v in part.grid), *others]
+        near = lambda at: [mixed([at, *(at.having({name: tuple(v)}) for v in part.near(of(at)))])]  # noqa: E731
+        return Candidate(part.fault, mixed(tried), lambda _: "", (near, *_NUISANCE), part.least)
 
     def _of_one(self, name: str, plant: Setting) -> Iterator[Candidate]:
         """Return a part of the joint that moves better if all joints have it."""
@@ -370,34 +379,11 @@ class Replay:
         if better.max() > 0.0 and f"{name} {joint}" not in plant:
             yield from part.of_joint(joint).candidates(plant, *_NUISANCE)
 
-    def _of_joints(self, name: str, plant: Setting) -> dict[str, float]:
-        """Return the values of a part by joint, of the joints that have one."""
-        return {j: plant.get(f"{name} {j}") for j in self.drives.joints if f"{name} {j}" in plant}
-
-    def _near(self, plant: Setting, name: str) -> list[Setting]:
-        own = self._of_joints(name, plant)
-        moved = {f"{name} {j}": _PARTS[name].near(value) for j, value in own.items()}
-        return [plant.having(dict(zip(moved, values, strict=True))) for values in zip(*moved.values(), strict=True)]
-
-    def _mixed(self, plants: Sequence[Setting], name: str) -> Setting:
-        """Return the first plant, in which each joint has the value of the plant in which it moves best.
-
-        A joint has one only if that explains a tenth of its error.
-        """
-        own = [self._of_joints(name, p) for p in plants]
-        bare = np.array([[j not in values for j in self.drives.joints] for values in own])
-        best = (np.array([self.errors(p) for p in plants]) * np.where(bare, 0.9, 1.0)).argmin(0)
-        kept = Setting(tuple((n, v) for n, v in plants[0].values if not n.startswith(f"{name} ")))
-        return kept.having(
-            {f"{name} {j}": own[k][j] for j, k in zip(self.drives.joints, best, strict=True) if j in own[k]}
-        )
-
-    def limited(self, plant: Setting) -> dict[str, str]:
-        """Return the joints whose torque limit is well below the model's, with the limit in words."""
-        torques = zip(self.drives.joints, self.asked, self.drives.limit, strict=True)
-        found = {j: (plant.get(f"limit {j}", np.inf) * asked, of_model) for j, asked, of_model in torques}
-        return {j: f"{j} at {nm:.3g} N m" for j, (nm, of_model) in found.items()
-                if _PARTS["limit"].is_off(nm / of_model)}  # fmt: skip
+    def limited(self, plant: Setting) -> dict[str, float]:
+        """Return the torque limits that are well below the model's, by joint [N m]."""
+        limits = np.array(plant.get("limit", np.inf)) * self.asked
+        low = np.array([_PARTS["limit"].is_off(share) for share in limits / self.drives.limit])
+        return {j: float(nm) for j, nm, is_low in zip(self.drives.joints, limits, low, strict=True) if is_low}
 
 
 def lowest_points(model: Any, data: Any) -> list[tuple[int, np.ndarray]]:
@@ -431,41 +417,41 @@ def solve_plant(
     age_s = 0.0 if log.rows_are_steps or log.age_s is None else float(np.median(log.age_s))
     nominal = Setting().having({"delay_s": max(0.0, (trained or 0.0) - age_s)})
     delay_s, base, best = fitted.get("delay_s", 0.0) + age_s, replay.error(nominal), replay.error(fitted)
-    # What may be a fault: its names in the setting, fault, sentence, value, and share of the error without it.
+    # What may be a fault: its name in the setting, fault, sentence, value, and share of the error without it.
     suspects = [
-        ([name], part.fault, own.says(fitted), fitted.get(name), part.drop)
-        for part in _PARTS.values() if part.of != "some"
+        (name, part.fault, own.says(fitted), fitted.get(name), part.drop)
+        for part in _PARTS.values() if part.of != "each"
         for own in map(part.of_joint, ("", *drives.joints))
         for name in own.names if name in fitted and part.is_off(fitted.get(name))
     ]  # fmt: skip
     if low := replay.limited(fitted):
-        names, part = [f"limit {j}" for j in low], _PARTS["limit"]
-        text = str(part.text).format(value=shortened(list(low.values())))
-        suspects.append((names, part.fault, text, min(fitted.get(n) for n in names), part.drop))
+        part = _PARTS["limit"]
+        text = str(part.text).format(value=shortened([f"{j} at {nm:.3g} N m" for j, nm in low.items()]))
+        suspects.append(("limit", part.fault, text, min(low.values()), part.drop))
     if delay_s - (0.010 if trained is None else trained) > _LATER_S:
         of_training = "none that is known" if trained is None else f"{1e3 * trained:.0f} ms"
         text = f"motion follows a target after {1e3 * delay_s:.0f} ms; the training had {of_training}"
-        suspects.append((["delay_s"], "delay", text, delay_s, 0.07))
-    for names, fault, text, value, least in suspects:
+        suspects.append(("delay_s", "delay", text, delay_s, 0.07))
+    for name, fault, text, value, least in suspects:
         # The others are estimated again without it.
-        rest = Setting(tuple((n, v) for n, v in fitted.values if n not in names))
-        moves = [*([_PARTS["kd"].move] if names != ["kd"] else []), *([_PARTS["kp"].move] if "kp" in rest else [])]
+        rest = Setting(tuple((n, v) for n, v in fitted.values if n != name))
+        moves = [*([_PARTS["kd"].move] if name != "kd" else []), *([_PARTS["kp"].move] if "kp" in rest else [])]
         if fault == "delay":
             rest = rest.having({"delay_s": nominal.get("delay_s")})
         else:
             moves.append(_DELAY.move)
         gap = replay.error(rest) - best
         rest = replace(start, setting=rest, moves=moves).descended(replay.error).setting
-        joints = [i for i, j in enumerate(drives.joints) if names[0].endswith(f" {j}") and fault != "torque limit"]
+        joints = [i for i, j in enumerate(drives.joints) if name.endswith(f" {j}")]
         without, with_it = (float(replay.errors(p)[joints or slice(None)].mean()) for p in (rest, fitted))
         if with_it <= (1.0 - least) * without:
             share = float(np.clip(gap / max(base - best, gap, 1e-9), 0.0, 1.0))
             question = "timing" if fault == "delay" else "plant"
-            findings.append(Finding(fault, question, text, share, {names[0].split()[0]: float(value)}))
+            findings.append(Finding(fault, question, text, share, {name.split()[0]: float(value)}))
     nominal = nominal.having({"delay_s": fitted.get("delay_s", 0.0)})
     figures = {
         "error": base, "error_fitted": best, "delay_s": delay_s,
-        **{n: fitted.get(n, part.usual) for n, part in _PARTS.items() if part.of not in ("one", "some")},
+        **{n: fitted.get(n, part.usual) for n, part in _PARTS.items() if part.of not in ("one", "each")},
         "joints": {j: [float(a), float(b)] for j, a, b in
                    zip(contract.joints, replay.errors(nominal), replay.errors(fitted), strict=True)},
         "sag_rad": dict(zip(contract.joints, replay.sag(nominal).tolist(), strict=True)),
