@@ -184,7 +184,7 @@ class TermSearch:
         for i in limits:
             present = base.present | (np.arange(len(base.present)) == i)
             if starts := self._limited(base, at, present):
-                trials.append(self._attempt(present, starts, base.loss))
+                trials.append(self._attempt(present, starts, base.loss, afresh=True))
         return trials
 
     def _limited(self, base: Trial, at: Linearised, present: np.ndarray) -> list[np.ndarray]:
@@ -208,18 +208,20 @@ class TermSearch:
             return []
         return [x[i] for i in (best, min(best + _LOWER, _LEVELS))]
 
-    def _attempt(self, present: np.ndarray, starts: Sequence[np.ndarray], most: float) -> Trial:
+    def _attempt(self, present: np.ndarray, starts: Sequence[np.ndarray], most: float, afresh: bool = False) -> Trial:
         """Return the fit of a set of terms ``(T,)`` from the best of some starts, and its errors by linear steps.
 
         Args:
             most: Loss of a smaller set; if the descent ends above it, it begins at the other starts, too.
+            afresh: Whether it begins at the nominal values, too: without a limit that acts, other estimates are bent.
         """
         problem, table = self._problem, self._problem.table
         part, names = problem.part(present=table.of_terms(present)), self._names(present)
         self._on_set(", ".join(names) or "no term")
         starts = [table.without_terms(x, present) for x in starts]
         order = np.argsort(np.nan_to_num([problem.loss(x, part) for x in starts], nan=np.inf))
-        ended = refine(problem, starts[order[0]][None], part, gain=ROUGH)
+        begins = [starts[order[0]], *([table.without_terms(table.start(), present)] if afresh else [])]
+        ended = refine(problem, np.stack(begins), part, gain=ROUGH)
         if len(order) > 1 and ended.loss > (1.0 - _LITTLE) * most:
             others = refine(problem, np.stack([starts[i] for i in order[1:3]]), part, gain=ROUGH)
             ended = min(ended, others, key=lambda end: end.loss)
