@@ -55,6 +55,7 @@ def run_seed(seed: int, runs: Path, options: argparse.Namespace) -> dict[str, An
         "true_model_rmse_rad": theirs,
         "prediction_over_true_model": ratio,
         "deployments": stages.deployed(run_dir, "success"),
+        "verdict": stages.verdict(run_dir),
     }
     if not options.no_nominal:
         baseline = stages.nominal_run("pendulum", seed, runs, run_dir)
@@ -67,6 +68,8 @@ def rows(seeds: list[Row]) -> list[Row]:
     lines = stages.rows("demo", seeds, {"train_s": "< 90", "total_s": "< 240", "error": "+-5"})
     ratio = [round(s["prediction_over_true_model"], 2) for s in seeds]
     lines.append(row("demo/prediction_over_true_model", ratio, "1", "true model, same commands", "< 1.5"))
+    wrong = sum(s["verdict"] == "re-identify" for s in seeds)
+    lines.append(row("demo/re_identify", wrong, f"of {len(seeds)} demos", "the robot is the identified one", "<= 0"))
     for key, label in (("deployments", "identified"), ("nominal_deployments", "nominal")):
         if key in seeds[0]:
             values = [round(d, 3) for s in seeds for d in s[key]]

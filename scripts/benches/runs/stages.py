@@ -91,6 +91,11 @@ def deployed(run_dir: Path, quantity: str) -> list[float]:
     return [episode["real"][quantity] for episode in result["episodes"]]
 
 
+def verdict(run_dir: Path) -> str:
+    """Return the verdict of deploy, such as ``fine``."""
+    return json.loads(done(run_dir, "deploy").output("result").read_text())["advice"]["status"]
+
+
 def rows(name: str, seeds: list[Row], goals: dict[str, str]) -> list[Row]:
     """Return seconds and errors of whole runs, one value a seed; goals by the end of a row's name."""
     lines = []
