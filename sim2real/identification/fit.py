@@ -41,6 +41,9 @@ _POLLED, _AWAY, _BETTER = 12, 0.5, 1e-3
 """Points that are tried around a descent that ended with more left; how far away [standard errors]; and by which share
 their loss must be lower. Where friction sticks, the derivative at a point does not describe the points around it."""
 _TRIES = 3
+_SHIFTS = (-0.5, -0.25, 0.25, 0.5)
+"""Delays at which further descents begin, from the estimate on [periods of the commands]. At 50 Hz an arm had valleys
+at 15, 21 and 28 ms: half a period alone leapt from the last to the first."""
 _DAMPING, _EASIER, _HARDER, _FAILED = 1e-3, 0.2, 10.0, 5
 """First damping of a round, as a share of the curvature; its factors after a good and after a failed step; steps that
 fail in turn and end a round."""
@@ -155,7 +158,7 @@ def fit(
 def _at_other_delays(problem: Problem, found: Refined, report: OnProgress | None) -> Refined:
     """Return the minimum that descents from other delays lead to if it is lower; else the one that was found.
 
-    They begin half a period of the commands below and above it, and again beside each lower minimum.
+    They begin a quarter and half a period of the commands below and above it, and again beside each lower minimum.
 
     A longer delay imitates an inertia: an arm's loss had a second minimum 7 ms above its delay of 20 ms, behind a
     ridge, with a fifth less armature.
@@ -165,13 +168,13 @@ def _at_other_delays(problem: Problem, found: Refined, report: OnProgress | None
     if not delays:
         return found
     nodes, lively = problem.rollouts.graph.nodes, problem.liveliest(problem.part())
-    half_s = 0.5 / min(nodes[name].rate for name in problem.model.given)
+    period_s = 1.0 / min(nodes[name].rate for name in problem.model.given)
     for _ in range(_TRIES):
         x, starts = found.x, []
         J = problem.linearise(x, lively).jacobian.reshape(-1, len(x))
-        for i, shift_s in itertools.product(delays, (-half_s, half_s)):
+        for i, shift in itertools.product(delays, _SHIFTS):
             others, start, column = np.delete(np.arange(len(x)), i), x.copy(), table.columns[i]
-            start[i] = column.to_scale(max(column.from_scale(x[i]) + shift_s, column.low))
+            start[i] = column.to_scale(max(column.from_scale(x[i]) + shift * period_s, column.low))
             if start[i] == x[i]:  # there is no shorter delay
                 continue
             # The others move as the linear model says; one that nothing determines stays.
