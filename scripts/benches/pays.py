@@ -327,6 +327,7 @@ def train_to_walk(name: str, task: str, way: str, unit: int, options: argparse.N
             {"day": day, "trial": 0, **_walked(robot, done.folder / "bundle", unit, day)}
             for day in range(options.days or CASES[name].days)
         ]
+    flags = [flag.replace(f"{options.folder}/", "") for flag in flags]
     return _kept((name, task, way, unit), train_s, trials, options, flags=flags)
 
 
