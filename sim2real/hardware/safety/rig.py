@@ -350,7 +350,7 @@ class Rig:
             if now > end:
                 raise HardwareLost(
                     f"the robot still moves after {timeout_s:g} s with torque off",
-                    hint="hold it still, or allow longer with --settle-s",
+                    hint="hold it still; deploy waits longer with --settle-s",
                 )
             self.clock.sleep(0.02)
 
