@@ -1,13 +1,8 @@
-"""Random models, made with PyMJCF or with our ``mjcf`` by the same calls: composed, changed, copied, renamed, detached.
-
-``python tests/composer/random_models.py 0 1000`` compares what MuJoCo compiles of the models of seeds 0 to 999.
-"""
+"""Random models, made with PyMJCF or with our ``mjcf`` by the same calls: composed, changed, copied, detached."""
 
 import contextlib
 import copy
 import importlib
-import sys
-import traceback
 from types import SimpleNamespace
 
 import mujoco
@@ -307,21 +302,3 @@ def compare(seed):
             {k: [p for p in zip(one[k], other[k], strict=False) if p[0] != p[1]] for k in one if one[k] != other[k]}
         )
     return ", ".join(differing_arrays(theirs, mine))
-
-
-def main(first, count):
-    found, refused = [], 0
-    for seed in range(first, first + count):
-        try:
-            what = compare(seed)
-        except Exception:
-            what = traceback.format_exc()
-        refused += isinstance(compiled(kit("sim2real"), seed), Exception)
-        if what:
-            found.append(seed)
-            print(seed, what[-1500:], flush=True)
-    print(f"{len(found)} of {count} models differ, {refused} are refused")
-
-
-if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))

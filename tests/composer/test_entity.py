@@ -8,7 +8,6 @@ from sim2real.composer import mjcf
 from sim2real.errors import UsageError
 
 ABOUT_Z = np.array([np.cos(np.pi / 4), 0, 0, np.sin(np.pi / 4)])
-ABOUT_X = np.array([np.cos(np.pi / 4), np.sin(np.pi / 4), 0, 0])
 
 
 class Ball(composer.Entity):

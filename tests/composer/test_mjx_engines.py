@@ -13,9 +13,7 @@ from mujoco import mjx
 from sim2real import composer
 from sim2real.composer import mjcf
 from sim2real.composer.mjx_environment import is_unstable
-from sim2real.composer.observation.observable import Generic, MJCFFeature
 from sim2real.composer.physics.mjx import constants, stepping
-from sim2real.composer.variation import PhysicsVariator, deterministic
 
 ENGINE = stepping.JaxEngine()
 
@@ -32,100 +30,10 @@ CHAIN = """
 """
 
 
-class Chain(composer.NullTask):
-    """Writes in every hook, some of which are read at once, some steps later, some never."""
-
-    def __init__(self):
-        arena = composer.Arena()
-        model = mjcf.from_xml_string(CHAIN)
-        arena.attach(composer.ModelWrapperEntity(model))
-        super().__init__(arena)
-        self.set_timesteps(0.02, 0.005)
-        self.joints, self.tip = model.find_all("joint"), model.find("site", "tip")
-        self.felt, self.actuators = model.find("sensor", "felt"), model.find_all("actuator")
-        self.vary = PhysicsVariator()
-        inertia = deterministic.Constant(np.array([0.003, 0.0035, 0.001]))
-        self.vary.bind_attributes(model.find("body", "lower"), mass=deterministic.Constant(0.6), inertia=inertia)
-
-    @property
-    def task_observables(self):
-        found = {
-            "q": MJCFFeature("qpos", self.joints),
-            "late": MJCFFeature("xpos", self.tip, delay=1, buffer_size=2),
-            "noisy": MJCFFeature("xpos", self.tip, corruptor=lambda value, random_state: value),
-            "felt": MJCFFeature("sensordata", self.felt),
-            "sum": Generic(lambda physics: physics.variables["sum"]),
-        }
-        for value in found.values():
-            value.enabled = True
-        return found
-
-    def initialize_episode(self, physics, random_state):
-        self.vary.apply_variations(physics, random_state)
-        physics.model.opt.gravity = np.array([0.5, 0.0, -6.0])
-        physics.model.opt.density, physics.model.opt.wind = 50.0, np.array([0.0, 0.0, 1.0])  # MJX has no air at first
-        physics.variables["sum"] = physics.np.zeros(2)
-        physics.bind(self.joints[0]).qpos = 0.2
-
-    def before_step(self, physics, action, random_state):
-        physics.bind(self.actuators).ctrl = action
-
-    def before_substep(self, physics, action, random_state):
-        height = physics.bind(self.tip).xpos[2]
-        physics.variables["sum"] = physics.variables["sum"] + height * physics.np.array([1.0, 0.0])
-
-    def after_substep(self, physics, random_state):
-        felt = physics.bind(self.felt).sensordata[2]
-        physics.variables["sum"] = physics.variables["sum"] + felt * physics.np.array([0.0, 1.0])
-
-    def after_step(self, physics, random_state):
-        physics.bind(self.joints[1]).qvel = physics.bind(self.joints[1]).qvel * 0.9
-
-    def get_reward(self, physics):
-        return physics.bind(self.tip).xpos[0]
-
-
 @pytest.fixture(scope="module")
 def double():
     with jax.enable_x64(True):
         yield
-
-
-@pytest.fixture(scope="module")
-def actions():
-    return np.random.RandomState(0).uniform(-1, 1, (20, 2))
-
-
-@pytest.fixture(scope="module")
-def played(double, actions):
-    """The start, and all states that follow."""
-    environment = composer.MjxEnvironment(Chain())
-
-    def play(key, actions):
-        start = environment.reset(key)
-        return start, jax.lax.scan(lambda s, a: (environment.step(s, a),) * 2, start, actions)[1]
-
-    return jax.jit(play)(jax.random.key(0), actions)
-
-
-@pytest.mark.night
-def test_streams_are_those_of_the_c_engine(played, actions):
-    """One task that writes in every hook; in `make test`, test_random_tasks.py compares tasks with hooks of all kinds,
-    and the tests below what is derived from what a hook writes.
-    """
-    start, states = played
-    env = composer.Environment(Chain())
-    step = env.reset()
-    for name, value in step.observation.items():
-        np.testing.assert_allclose(start.observation[name], value, atol=1e-9, err_msg=name)
-    for i, action in enumerate(actions):
-        step = env.step(action)
-        for name, value in step.observation.items():
-            np.testing.assert_allclose(
-                states.observation[name][i], value, rtol=1e-9, atol=1e-9, err_msg=f"{name} at {i}"
-            )
-        np.testing.assert_allclose(states.data.qpos[i], env.physics.data.qpos, atol=1e-9)
-        np.testing.assert_allclose(states.reward[i], step.reward, atol=1e-9)
 
 
 BODIES = """

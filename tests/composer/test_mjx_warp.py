@@ -10,7 +10,6 @@ from flax import struct
 from sim2real import composer
 from sim2real.composer import mjcf
 from sim2real.composer.observation.observable import Generic, MJCFFeature
-from sim2real.composer.physics.mjx import constants
 from sim2real.composer.variation import PhysicsVariator, distributions, noises
 from sim2real.errors import UsageError
 from sim2real.graph import Base, BaseNode
@@ -288,12 +287,6 @@ def test_the_same_graph_runs_on_both(installed):
     mine, theirs = in_a_graph("warp"), in_a_graph("jax")
     np.testing.assert_allclose(mine, theirs, atol=1e-5)
     assert np.abs(mine[0] - mine[1]).max() > 1e-3
-
-
-def test_which_constants_are_derived_is_known_before(installed):
-    environment = composer.MjxEnvironment(Throw(), impl="warp")
-    host, model = environment.model, environment.mjx_model
-    assert constants.derived(host, model) == set(jax.eval_shape(lambda m: constants.derive(host, m), model))
 
 
 def refused(match, task=None, **options):

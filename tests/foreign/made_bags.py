@@ -15,7 +15,6 @@ STATE = "sensor_msgs/msg/JointState"
 NUMBERS = "std_msgs/msg/Float64MultiArray"
 CONTROLLER = "control_msgs/msg/JointTrajectoryControllerState"
 IMAGE = "sensor_msgs/msg/Image"
-POINTS = ("reference", "feedback", "error", "output", "desired", "actual")
 POINT = (
     f"{LINE}MSG: trajectory_msgs/JointTrajectoryPoint\nfloat64[] positions\nfloat64[] velocities\n"
     f"builtin_interfaces/Duration time_from_start\n{LINE}MSG: builtin_interfaces/Duration\nint32 sec\nuint32 nanosec\n"

@@ -30,7 +30,6 @@ FOUR_BAR = """<mujoco><compiler angle="radian"/><worldbody>
 <actuator><motor joint="crank"/></actuator></mujoco>"""
 LINK = """<inertial><origin xyz="0.03 0 0"/><mass value="0.1"/>
   <inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial>"""
-MANY = "more than 10000 elements"
 
 
 @pytest.fixture(autouse=True)

@@ -11,9 +11,7 @@ from sim2real.graph.delays import TrainableDist
 TS, LOW, HIGH, PERIOD = 0.2, 0.005, 0.05, 0.02
 SENT = np.array([0.10, 0.12, 0.14, 0.16, 0.18])
 DELAY = 0.034  # the last arrival before TS is that of 0.16, at 0.194; the next one comes at 0.214
-PART = (TS - 0.194) / 0.02
 HELD, NEXT = 3, 4
-FLOATS = ["float32", "float16", "bfloat16", "complex64"]
 WHOLE = ["uint8", "int8", "uint16", "int16", "uint32", "int32"]
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 PWM, POSITION, VELOCITY = 16, 3, 1
 STEP_S = 0.00025
@@ -131,13 +130,6 @@ class Ramp:
 
     def truth(self):
         return {}
-
-
-@dataclass
-class Still:
-    """A dataclass, which only works in a module that Python knows by name."""
-
-    servo_ids: tuple[int, ...] = (1,)
 
 
 class Sinking(Joints):

@@ -88,9 +88,3 @@ def fitted():
         loss=problem.loss,
         make_problem=make_problem,
     )
-
-
-@pytest.fixture
-def late_problem():
-    """A log of the same pendulum, whose actuator's delay deviates by 4 ms."""
-    return make_problem(synthetic_log(np.random.default_rng(1), 0.004)[0])

@@ -17,7 +17,6 @@ G = 9.81
 TICK_S = 0.01
 
 speeds = st.floats(-50.0, 50.0, width=32)
-coefficients = st.floats(0.0, 20.0, width=32)
 
 
 class Block(JointWorld):
