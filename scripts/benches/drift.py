@@ -160,9 +160,10 @@ def one_change(
     arm: arms.HiddenArm, change: str, pipeline: Any, identified: Any, folder: Path, options: argparse.Namespace
 ) -> dict[str, Any]:
     """Return the test's results for a robot after one change, from a deployment with the small steps."""
+    from sim2real.artifacts.deployment import Deployment, EpisodeRow
     from sim2real.artifacts.recording import Recording
     from sim2real.stages.deploy.replay import tested
-    from sim2real.stages.deploy.verdict import model_advice
+    from sim2real.stages.deploy.verdict import decide
 
     now, first = changed(arm, change), 1 + list(CAUSES).index(change) * (options.episodes + 2)
     logs = [folder / f"{change}_{e}.mcap" for e in range(options.episodes + 1)]
@@ -173,13 +174,15 @@ def one_change(
         replay, drifted = tested(pipeline, identified, [Recording.load(log).episode for log in logs])
     except Sim2RealError as error:
         return {"refused": str(error)}
-    verdict = model_advice(replay, drifted)
+    # Of a policy that fails, the verdict is about the model unless the model holds.
+    failed = (EpisodeRow({"success": 0.0}),)
+    verdict = decide(Deployment(failed, replay=tuple(replay), drift=drifted))
     print(f"robot {arm.seed}, {change}: {drifted.changes[0].name}, alarms {drifted.alarms}", flush=True)
     return {
         "alarms": list(drifted.alarms),
         "named": drifted.named.name if drifted.named else "",
         "likely": drifted.likely.name if drifted.likely else "",
-        "verdict": "" if verdict is None else verdict.status,
+        "verdict": "" if verdict.status == "re-train" else verdict.status,
     }
 
 

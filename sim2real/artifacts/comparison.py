@@ -97,8 +97,8 @@ def _figures_of(run: ComparedRun) -> dict[str, Json]:
         for row in identification.held_out:
             figures[f"error {row.seconds:g} s ahead, {row.name} [{row.unit}]"] = row.error
     if (deployment := run.deployment) is not None:
-        if deployment.advice is not None:
-            figures["deployment"] = deployment.advice.status
+        if deployment.verdict is not None:
+            figures["deployment"] = deployment.verdict.status
         figures["episodes"] = len(deployment.episodes)
         for gap in deployment.gap:
             figures[f"{gap.quantity} [{gap.unit}]" if gap.unit else gap.quantity] = gap.real

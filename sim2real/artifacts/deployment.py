@@ -1,11 +1,12 @@
-"""The artifact of deploy: episodes of a policy on the robot, and of the same policy in simulation."""
+"""The artifact of deploy: a row for each episode on the robot, the tests of the model on their logs, the verdict."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import numpy as np
 
@@ -19,12 +20,12 @@ from sim2real.artifacts.files import (
     write_json,
 )
 from sim2real.artifacts.paths import shown
-from sim2real.artifacts.recording import TRUTH, Recording
+from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.summary import ArtifactTable, Interval, Shown, words_and_unit
 from sim2real.log.schema import unit_of
 from sim2real.types import Json
 
-FORMAT = 4
+FORMAT = 5
 RESULT, SIMULATION = "result.json", "simulation.npz"
 PROBE = "probe.mcap"
 """Log of the small steps that measure the delay before the episodes."""
@@ -35,21 +36,29 @@ _RUN = "{run}"
 """Placeholder for the run's folder in the next command, as the folder may move."""
 
 
+# -- the episodes, and the same in simulation
+
+
 @dataclass(frozen=True)
-class Scores:
-    """Scores of one episode: name -> value; the value is None if it does not exist, such as the time to a missed goal.
+class EpisodeRow:
+    """One episode on the robot. A score is None if it does not exist, such as the time to a missed goal.
 
     Attributes:
-        simulation: Scores of the same policy in simulation; None without a simulation.
+        real: Scores on the robot: name -> value.
+        simulation: Scores of the same episode in simulation, means over its simulations; empty without any.
+        late: Node -> share of the steps that take longer than those of training.
+        paused_s: Time that the slowest node lost in steps of two periods or more [s].
     """
 
     real: Mapping[str, float | None]
-    simulation: Mapping[str, float | None] | None = None
+    simulation: Mapping[str, float | None] = field(default_factory=dict)
+    late: Mapping[str, float] = field(default_factory=dict)
+    paused_s: float = 0.0
 
 
 @dataclass(frozen=True)
 class Gap:
-    """One quantity on the robot and in simulation: means over episodes and over simulations."""
+    """One quantity on the robot, and in simulation or in training."""
 
     quantity: str
     real: float | None
@@ -58,8 +67,11 @@ class Gap:
 
     @property
     def gap(self) -> float | None:
-        """The robot's value less that in simulation."""
+        """The robot's value less the other one."""
         return None if self.real is None or self.simulation is None else self.real - self.simulation
+
+
+# -- the tests of the model
 
 
 @dataclass(frozen=True)
@@ -80,6 +92,12 @@ class Replay:
     rmse: Mapping[str, float | None]
     expected: float | None = None
     column: str = ""
+
+    def error(self, model: str) -> str:
+        """Return a model's error beside the expected one, as a text."""
+        error = self.rmse.get(model)
+        size = "it diverges" if error is None else f"off by {error:.2g} {self.unit}"
+        return f"{size} {self.horizon_s:g} s ahead, expected were {self.expected or 0.0:.2g} {self.unit}"
 
 
 _MIN_SHARE = 0.5
@@ -109,6 +127,12 @@ class Changed:
     high95: float
     explains: float
     p: float
+
+    def __str__(self) -> str:
+        if self.unit == "":
+            return f"{self.name} is {self.now:.2f} times its former value [{self.low95:.2f}, {self.high95:.2f}]"
+        now, ends = f"{self.now:.4g} {self.unit}", f"[{self.low95:.4g}, {self.high95:.4g}]"
+        return f"{self.name} is {now} {ends}, identified were {self.before:.4g}"
 
 
 @dataclass(frozen=True)
@@ -165,19 +189,50 @@ class Drift:
         return ArtifactTable(headers, rows)
 
 
+# -- the verdict
+
+
+class Finding(StrEnum):
+    """What a verdict rests on; ``Deployment.sentence`` has the words."""
+
+    SUCCESS = "success"
+    LATE = "late steps"
+    PAUSED = "pauses"
+    UNEXPLAINED = "unexplained motion"
+    CHANGED = "change"
+    LIKELY = "likely change"
+    WRONG = "wrong prediction"
+    HOLDS = "model holds"
+    NO_MODEL = "no model"
+    OTHER_MOTION = "other motion"
+    UNTESTED = "model not tested"
+
+
+Status: TypeAlias = Literal["fine", "re-identify", "re-train", "look at this joint", "not judged"]
+
+
 @dataclass(frozen=True)
-class Advice:
-    """The verdict on a deployment, and the next command.
+class Reason:
+    """A finding, and what it is about: a joint, a node, a parameter, or why the model is not tested."""
+
+    finding: Finding
+    about: str = ""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The verdict on a deployment.
 
     Attributes:
+        reasons: The one that decides first.
+        stages: The stages to run next; empty if none helps, or none is needed.
         next: The command to type; "" if none is needed.
-        joint: The joint to look at; "" for none.
     """
 
-    status: Literal["fine", "re-identify", "re-train", "look at this joint", "not judged"]
-    reasons: tuple[str, ...]
+    status: Status
+    reasons: tuple[Reason, ...]
+    stages: tuple[str, ...] = ()
     next: str = ""
-    joint: str = ""
 
 
 @dataclass(frozen=True, repr=False)
@@ -185,49 +240,112 @@ class Deployment(Shown):
     """Episodes on the robot, and the same policy in simulation.
 
     Attributes:
+        times: Times on the robot, and the times that the policy was trained with.
+        replay: Prediction errors of the identified and of the nominal model on the recorded commands.
+        drift: Test for parameters that have changed since the identification; None if it did not run.
+        untested: Why the model is not tested on these logs; None if it is.
+        verdict: None after a dry run.
+        dry_run: Whether commands were not sent: then there are no scores, no simulation and no gap.
         simulated: Columns of each episode's simulation: ``t`` [s] and a field's values ``(N,)``; a field with its own
             times has them as ``t_FIELD``. Empty without a simulation.
         probe: Log of the small steps that measure the delay; None if the delay was not measured.
-        trained: Times on the robot, and the times that the policy was trained with.
-        replay: Prediction errors of the identified and of the nominal model on the recorded commands.
-        drift: Test for parameters that have changed since the identification; None if it did not run.
-        advice: The verdict; None in older files and after a dry run.
-        dry_run: Whether commands were not sent: then there are no scores, no simulation and no gap.
         summary: Summary of each episode's session; empty for a loaded artifact.
     """
 
-    episodes: tuple[Scores, ...]
-    gap: tuple[Gap, ...]
+    episodes: tuple[EpisodeRow, ...]
     units: Mapping[str, str] = field(default_factory=dict)
+    times: tuple[Gap, ...] = ()
+    replay: tuple[Replay, ...] = ()
+    drift: Drift | None = None
+    untested: Reason | None = None
+    verdict: Verdict | None = None
+    dry_run: bool = False
+    format: int = FORMAT
     simulated: tuple[Mapping[str, np.ndarray], ...] = ()
     recordings: tuple[Recording, ...] = ()
     probe: Recording | None = None
-    trained: tuple[Gap, ...] = ()
-    replay: tuple[Replay, ...] = ()
-    drift: Drift | None = None
-    advice: Advice | None = None
-    dry_run: bool = False
-    format: int = FORMAT
     summary: tuple[Mapping[str, Json], ...] = ()
 
     def __post_init__(self) -> None:
         check(bool(self.episodes), "no episode")
 
+    @property
+    def gap(self) -> tuple[Gap, ...]:
+        """The scores on the robot and in simulation, means over the episodes."""
+        names = dict.fromkeys(name for episode in self.episodes for name in episode.real)
+        return tuple(self.score(name) for name in names)
+
+    def score(self, name: str) -> Gap:
+        """Return the mean of a score over the episodes that have it."""
+        real = mean([e.real.get(name) for e in self.episodes])
+        return Gap(name, real, mean([e.simulation.get(name) for e in self.episodes]))
+
+    def late_share(self, node: str) -> float:
+        """Return the share of a node's steps that take longer than those of training, over all episodes."""
+        return mean([e.late.get(node) for e in self.episodes]) or 0.0
+
+    @property
+    def logs(self) -> tuple[Recording, ...]:
+        """The logs of this deployment: its episodes, then the small steps before them."""
+        return self.recordings if self.probe is None else (*self.recordings, self.probe)
+
+    # What pages and the console show.
+
     def about(self) -> Mapping[str, Json]:
         """Return episodes, verdict, reasons and the next command, by name."""
-        advice = self.advice
         facts: dict[str, Json] = {"episodes": len(self.episodes), "dry run": self.dry_run or ""}
-        if advice is not None:
-            facts |= {"verdict": advice.status, "why": "; ".join(advice.reasons), "next": advice.next}
+        if self.verdict is not None:
+            facts |= {"verdict": self.verdict.status, "why": "; ".join(self.reasons), "next": self.verdict.next}
         return {name: value for name, value in facts.items() if value}
 
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """The reasons of the verdict as sentences, the one that decides first."""
+        return tuple(self.sentence(reason) for reason in self.verdict.reasons) if self.verdict else ()
+
+    def sentence(self, reason: Reason) -> str:
+        """Return a reason as a sentence, with the numbers of this deployment."""
+        about, joint = reason.about, next((row for row in self.replay if row.name == reason.about), None)
+        changed = next((c for c in self.drift.changes if c.name == about), about) if self.drift else about
+        match reason.finding:
+            case Finding.SUCCESS:
+                success = self.score("success")
+                if success.real is None:
+                    return "this task measures no success"
+                beside = "" if success.simulation is None else f", in simulation {success.simulation:.2f}"
+                return f"success is {success.real:.2f}{beside}"
+            case Finding.LATE:
+                return f"{self.late_share(about):.1%} of the steps of {about} take longer than in training"
+            case Finding.PAUSED:
+                most_s = max(e.paused_s for e in self.episodes)
+                return f"an episode lost {most_s:.2g} s to pauses of its nodes, and no simulation has such pauses"
+            case Finding.UNEXPLAINED:
+                error = f": {joint.error(AS_HERE)}" if joint else ""
+                return f"no parameters explain how {about} moves{error}; it may be loose, blocked, or touch something"
+            case Finding.CHANGED:
+                others = [name for name in self.drift.alarms if name != about] if self.drift else []
+                less = f"; less likely, each alone: {', '.join(others)}" if others else ""
+                return f"the robot has changed: {changed}{less}"
+            case Finding.LIKELY:
+                return f"most likely the robot has changed: {changed}"
+            case Finding.WRONG:
+                return f"{about}: {joint.error('identified')}" if joint else about
+            case Finding.HOLDS:
+                return "the model holds"
+            case Finding.NO_MODEL:
+                return "this run has no identification, so there is no model to compare with"
+            case Finding.OTHER_MOTION:
+                return f"the deployment does not test the model: {about}"
+            case Finding.UNTESTED:
+                return about
+
     def rows(self) -> ArtifactTable:
-        """Return the gap: a row for each quantity."""
+        """Return the gap: a row for each score."""
         return _gap_table(("quantity", "robot", "simulation", "gap", "unit"), self.gap, self.units)
 
     def times_table(self) -> ArtifactTable:
         """Return the times on the robot and in training: a row for each."""
-        return _gap_table(("times", "robot", "in training", "gap", "unit"), self.trained, {})
+        return _gap_table(("times", "robot", "in training", "gap", "unit"), self.times, {})
 
     def replay_table(self) -> ArtifactTable:
         """Return the prediction errors of each model on the recorded commands: a row for each position."""
@@ -236,42 +354,38 @@ class Deployment(Shown):
         rows = [[r.name, *(r.rmse.get(m) for m in models), r.expected, r.unit] for r in self.replay]
         return ArtifactTable((horizon, *models, "expected", "unit"), rows)
 
+    # The files.
+
     def save(self, folder: Path | str) -> dict[str, str]:
-        """Write scores and simulation into a folder; the logs are in it already.
+        """Write the rows, the verdict and the simulation into a folder; the logs are in it already.
 
         Returns:
             Output -> name of the file in the folder.
         """
-        folder, advice = make_folder(folder), self.advice
-        if advice is not None:
-            advice = replace(advice, next=advice.next.replace(shown(folder.parent), _RUN))
-        document = replace(self, advice=advice)
+        folder = make_folder(folder)
+        document = self._next_with(shown(folder.parent), _RUN)
         write_json(folder / RESULT, document, without=("simulated", "recordings", "probe", "summary"))
         if self.dry_run:
             return {"result": RESULT}
-        columns = {f"{n}_{i}": v for i, episode in enumerate(self.simulated) for n, v in episode.items()}
+        columns = {f"{i}/{n}": v for i, episode in enumerate(self.simulated) for n, v in episode.items()}
         write_arrays(folder / SIMULATION, columns)
         return {"result": RESULT, "simulation": SIMULATION}
 
-    @property
-    def logs(self) -> tuple[Recording, ...]:
-        """The logs of this deployment: its episodes, then the small steps before them."""
-        return self.recordings if self.probe is None else (*self.recordings, self.probe)
+    def _next_with(self, old: str, new: str) -> Deployment:
+        """Return the deployment with another run's folder in its next command."""
+        if self.verdict is None:
+            return self
+        return replace(self, verdict=replace(self.verdict, next=self.verdict.next.replace(old, new)))
 
     @staticmethod
     def read(folder: Path) -> Deployment:
-        """Read scores and verdict, without simulations and logs.
+        """Read rows and verdict, without simulations and logs.
 
         Raises:
             Sim2RealError: When the file is missing, malformed, or of another format.
         """
         deployment = read_versioned(folder / RESULT, Deployment, _AGAIN, FORMAT)
-        if deployment.advice is None:
-            return deployment
-        return replace(
-            deployment,
-            advice=replace(deployment.advice, next=deployment.advice.next.replace(_RUN, shown(folder.parent))),
-        )
+        return deployment._next_with(_RUN, shown(folder.parent))
 
     @staticmethod
     def load(folder: Path | str) -> Deployment:
@@ -282,17 +396,22 @@ class Deployment(Shown):
         """
         folder = Path(folder)
         deployment = Deployment.read(folder)
-        arrays: dict[str, np.ndarray] = {}
+        numbers = range(len(deployment.episodes))
+        simulated: list[dict[str, np.ndarray]] = [{} for _ in numbers]
         if not deployment.dry_run:
             with malformed(folder / SIMULATION, _AGAIN):
-                arrays = read_arrays(folder / SIMULATION)
-        numbers = range(len(deployment.episodes))
-        # An embedded robot that runs on from one episode to the next writes a single file of true states.
-        truths = [p if (p := folder / f"truth_{i}.bin").is_file() else folder / TRUTH for i in numbers]
-        recordings = tuple(Recording.load(log_of(folder, i), truths[i]) for i in numbers)
+                for name, values in read_arrays(folder / SIMULATION).items():
+                    number, _, column = name.partition("/")
+                    simulated[int(number)][column] = values
+        recordings = tuple(Recording.load(log_of(folder, i)) for i in numbers)
         probe = Recording.load(folder / PROBE) if (folder / PROBE).is_file() else None
-        simulated = tuple(_of_episode(arrays, i) for i in numbers)
-        return replace(deployment, simulated=simulated, recordings=recordings, probe=probe)
+        return replace(deployment, simulated=tuple(simulated), recordings=recordings, probe=probe)
+
+
+def mean(values: Sequence[float | None]) -> float | None:
+    """Return the mean of the values that exist; None if none does."""
+    present = [v for v in values if v is not None]
+    return float(np.mean(present)) if present else None
 
 
 def _gap_table(headers: Sequence[str], gaps: Sequence[Gap], units: Mapping[str, str]) -> ArtifactTable:
@@ -308,9 +427,3 @@ def _gap_table(headers: Sequence[str], gaps: Sequence[Gap], units: Mapping[str, 
 def log_of(folder: Path, number: int) -> Path:
     """Return the path of an episode's log."""
     return folder / f"episode_{number}.mcap"
-
-
-def _of_episode(arrays: Mapping[str, np.ndarray], number: int) -> dict[str, np.ndarray]:
-    """Return the columns of one episode's simulation, whose names end with its number."""
-    suffix = f"_{number}"
-    return {n.removesuffix(suffix): v for n, v in arrays.items() if n.endswith(suffix)}

@@ -71,8 +71,6 @@ def _judged(stages: tuple[str, ...], folder: StageFolder) -> Iteration:
         why = folder.manifest.error.splitlines()[0].partition(": ")[2]
         return Iteration(stages, folder, verdict="re-identify", why=why)
     deployment = Deployment.read(folder.folder)
-    success = next((g for g in deployment.gap if g.quantity == "success"), None)
-    real, simulation = (None, None) if success is None else (success.real, success.simulation)
-    if (advice := deployment.advice) is None:
-        return Iteration(stages, folder, real, simulation)
-    return Iteration(stages, folder, real, simulation, advice.status, next(iter(advice.reasons), ""))
+    success, verdict = deployment.score("success"), deployment.verdict
+    status = "not judged" if verdict is None else verdict.status
+    return Iteration(stages, folder, success.real, success.simulation, status, next(iter(deployment.reasons), ""))

@@ -22,7 +22,7 @@ from sim2real.commands.stages import module_of
 from sim2real.errors import DelayChanged, Sim2RealError, UsageError
 from sim2real.robots.robot import RecordedRobot, Robot
 from sim2real.stages.config import DeployConfig, IdentifyConfig, RecordConfig, TrainConfig
-from sim2real.stages.deploy.verdict import logs_to_identify, needs_timing, terms_to_identify
+from sim2real.stages.deploy.verdict import logs_to_identify, terms_to_identify
 from sim2real.stages.load import AnyRobot, defaults_of, robot_of, shipped_policy
 from sim2real.stages.shared.arguments import AnyPath, config_of, folder_of
 from sim2real.stages.shared.find_run import find_run
@@ -174,15 +174,14 @@ class _Iterating:
         """Return the plan that follows from the newest deployment."""
         deployment = Deployment.read(folder.folder)
         # Stop if the policy works, or if no stage can improve the result.
-        advice = deployment.advice
-        if advice is None or advice.status in ("look at this joint", "not judged"):
-            reason = advice.reasons[0] if advice and advice.reasons else "the deployment was not judged"
-            return Plan((), f"stop: {reason}")
-        if advice.status == "fine":
+        verdict = deployment.verdict
+        if verdict is None or verdict.status in ("look at this joint", "not judged"):
+            return Plan((), f"stop: {next(iter(deployment.reasons), 'the deployment was not judged')}")
+        if verdict.status == "fine":
             return Plan((), "stop: the policy works on the robot")
         # Train again if the model holds and the timing of the training does, too.
         seed = self._next_seed(run_dir)
-        if advice.status != "re-identify" and not needs_timing(advice):
+        if verdict.stages == ("train",):
             return Plan(("train", "deploy"), "train with another seed, deploy", seed=seed)
         # Otherwise identify from the deployment's logs, or record first if they are too short.
         identification = self._newest_identification(run_dir)

@@ -75,8 +75,10 @@ def conclude(run_dir: Path) -> None:
 
     page = write_report(run_dir)
     deployed = finished(run_dir, "deploy")
-    advice = None if deployed is None else Deployment.read(deployed.folder).advice
-    result = "the run is finished" if advice is None else f"{advice.status}: {'; '.join(advice.reasons)}"
+    deployment = None if deployed is None else Deployment.read(deployed.folder)
+    result = "the run is finished"
+    if deployment is not None and deployment.verdict is not None:
+        result = f"{deployment.verdict.status}: {'; '.join(deployment.reasons)}"
     print(f"{result}. {f'Open {shown(page)}' if page else ''}".rstrip(), flush=True)
 
 

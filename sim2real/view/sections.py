@@ -9,7 +9,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
 from sim2real.artifacts.bundle import GOOD_SUCCESS, History
-from sim2real.artifacts.deployment import Deployment, Scores
+from sim2real.artifacts.deployment import Deployment, EpisodeRow
 from sim2real.artifacts.episodes import Episodes
 from sim2real.artifacts.identification import Identification, with_small_unit, worst_window
 from sim2real.artifacts.iterations import iterations, iterations_table
@@ -258,14 +258,10 @@ def deploy_section(artifact: StageFolder) -> PageSection:
     for index, log in enumerate(logs):
         blocks += timing_blocks(log.episode, f"deploy-{index}", f" Episode {index}.", folded=index > 0)
     # The tiles have the success on the robot and in simulation.
-    real, simulated = (
-        [float(value) for s in scores if (value := (s or {}).get("success")) is not None]
-        for scores in ([e.real for e in deployed.episodes], [e.simulation for e in deployed.episodes])
-    )
-    tiles = []
-    if real:
-        note = f"in simulation {np.mean(simulated):.0%}" if simulated else ""
-        tiles.append(Tile("success on the robot", f"{np.mean(real):.0%}", note))
+    success, tiles = deployed.score("success"), []
+    if success.real is not None:
+        note = "" if success.simulation is None else f"in simulation {success.simulation:.0%}"
+        tiles.append(Tile("success on the robot", f"{success.real:.0%}", note))
     tiles += [Tile("episodes", str(len(deployed.episodes))), *timing_tiles([log.episode for log in logs])]
     lead = f"The policy on {_beside(deployed)}."
     figure = largest_difference(episodes, [row.column for row in deployed.replay], units, "deploy-worst")
@@ -282,13 +278,14 @@ def _beside(deployed: Deployment) -> str:
 
 def _deploy_banner(deployed: Deployment) -> Banner | None:
     """Return the verdict on a deployment: the first reason, the next command, further reasons; None for older files."""
-    advice = deployed.advice
-    if deployed.dry_run or advice is None:
+    verdict = deployed.verdict
+    if deployed.dry_run or verdict is None:
         return _DRY if deployed.dry_run else None
-    title = f"{advice.status[:1].upper()}{advice.status[1:]}" + (f": {advice.joint}" if advice.joint else "")
-    reasons = [sentence(reason, [row.name for row in deployed.replay]) for reason in advice.reasons]
-    reasons[1:1] = [f"next: {advice.next}"] if advice.next else []
-    return Banner(_DEPLOYED.get(advice.status, "doubt"), title, reasons)
+    joint = f": {verdict.reasons[0].about}" if verdict.status == "look at this joint" else ""
+    title = f"{verdict.status[:1].upper()}{verdict.status[1:]}{joint}"
+    reasons = [sentence(reason, [row.name for row in deployed.replay]) for reason in deployed.reasons]
+    reasons[1:1] = [f"next: {verdict.next}"] if verdict.next else []
+    return Banner(_DEPLOYED.get(verdict.status, "doubt"), title, reasons)
 
 
 def deployment_svg(pairs: Sequence[ComparedSeries], units: Mapping[str, str], number: int, name: str) -> str:
@@ -353,14 +350,13 @@ def _shown(pairs: Sequence[ComparedSeries]) -> list[ComparedSeries]:
     ]
 
 
-def _scores(score: Scores) -> str:
+def _scores(episode: EpisodeRow) -> str:
     """Return the scores of an episode as a sentence."""
-    simulation = score.simulation or {}
     both = [
-        f"{label}: robot {number(score.real.get(n), 3)}"
-        + (f", simulation {number(simulation.get(n), 3)}" if n in simulation else "")
+        f"{label}: robot {number(value, 3)}"
+        + (f", simulation {number(episode.simulation[n], 3)}" if n in episode.simulation else "")
         + ("" if unit == "1" else f" {unit}")
-        for n in dict.fromkeys([*score.real, *simulation])
+        for n, value in episode.real.items()
         for label, unit in [words_and_unit(n)]
     ]
     text = "; ".join(both)
@@ -383,7 +379,7 @@ def _deploy_tables(deployed: Deployment) -> list[Block]:
             f"{deployed.replay[0].horizon_s:g} s ahead, and the expected error of the identification."
         )
         blocks.append(TableBlock.of(caption, deployed.replay_table()))
-    if deployed.trained:
+    if deployed.times:
         caption = "Times on the robot, and the times that the policy was trained with"
         blocks.append(TableBlock.of(caption, deployed.times_table()))
     return blocks

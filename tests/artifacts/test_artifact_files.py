@@ -1,6 +1,7 @@
 """Files of artifacts: what is written is read back, to the last bit; what is damaged is refused in words."""
 
 import dataclasses
+import enum
 import json
 import math
 import random
@@ -64,8 +65,8 @@ def drawn(kind: typing.Any, rng: random.Random, tame: bool = False) -> typing.An
         return kind(rng.randrange(2))
     if dataclasses.is_dataclass(kind):
         return built(kind, rng, tame)
-    if origin is typing.Literal:
-        return rng.choice(inner)
+    if origin is typing.Literal or isinstance(kind, enum.EnumType):
+        return rng.choice(inner or list(kind))
     if origin is tuple:
         return tuple(drawn(k, rng, tame) for k in (inner if inner[-1] is not Ellipsis else inner[:1] * 2))
     if origin in (dict, Mapping):

@@ -112,9 +112,9 @@ def test_a_run_records_identifies_and_deploys_the_shipped_policy(tmp_path, capsy
         assert p.estimate == pytest.approx(p.truth, rel=0.2), p.name  # of 6 s, on a busy machine
     trip = next(p for p in found.parameters if p.name == ROUND_TRIP)
     assert trip.estimate == pytest.approx(trip.truth, abs=0.001)
-    advice = Deployment.read(run / "deploy").advice
-    assert advice.status == "fine"
-    assert "does not test the model" in advice.reasons[-1]
+    deployment = Deployment.read(run / "deploy")
+    assert deployment.verdict.status == "fine"
+    assert "does not test the model" in deployment.reasons[-1]
 
 
 @pytest.mark.night  # test_weighing.py has the load from a log of the emulator's clock

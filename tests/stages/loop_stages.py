@@ -5,7 +5,7 @@ import signal
 from dataclasses import replace
 from pathlib import Path
 
-from sim2real.artifacts.deployment import Advice, Changed, Deployment, Drift, Gap, Scores
+from sim2real.artifacts.deployment import Changed, Deployment, Drift, EpisodeRow, Finding, Reason, Verdict
 from sim2real.artifacts.identification import ROUND_TRIP, Estimate, Identification, Judgement
 from sim2real.artifacts.run import STAGES, TAKES, Source, attempts, newest, open_stage, portable, sha256
 from sim2real.commands.loop import run_all
@@ -17,11 +17,14 @@ TRIP = Estimate(ROUND_TRIP, "s", "derived", "", 0.0, 0.02, "ok")
 FRICTION = Changed("friction", "rad/s^2", 6.0, 12.0, 11.0, 13.0, 0.9, 1e-20)
 
 
-def verdict(status, success=0.5, reason="why", seconds=18.0, drift=False):
+STAGES_OF = {"re-identify": ("identify",), "re-train": ("train",)}
+
+
+def verdict(status, success=0.5, reason="why", seconds=18.0, drift=False, stages=None):
     """Return a deployment that was judged so."""
     alarms = Drift((FRICTION if drift else replace(FRICTION, p=0.8),), 0.05, ("friction",) if drift else (), seconds)
-    gap = (Gap("success", success, 1.0),)
-    return Deployment((Scores({}),), gap, drift=alarms, advice=Advice(status, (reason,)))
+    judged = Verdict(status, (Reason(Finding.UNTESTED, reason),), stages or STAGES_OF.get(status, ()))
+    return Deployment((EpisodeRow({"success": success}, {"success": 1.0}),), drift=alarms, verdict=judged)
 
 
 class Stages:

@@ -14,7 +14,7 @@ import pytest
 import shared_run
 
 from sim2real.artifacts.bundle import Bundle
-from sim2real.artifacts.deployment import PROBE, Deployment, Gap, Scores, log_of
+from sim2real.artifacts.deployment import PROBE, Deployment, EpisodeRow, log_of
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.iterations import iterations
 from sim2real.artifacts.recording import LOG, Recording
@@ -67,10 +67,8 @@ def world(tmp_path, finished_run_dir):
         hidden.write(log_of(stage.folder, 0), hidden.play(later, policy, config.duration_s, 1))
         hidden.write(stage.output("probe", PROBE), hidden.play(later, hidden.probed(), 8.0, 2))
         logs = (Recording.load(log_of(stage.folder, 0)),)
-        gap = (Gap("success", 0.0, None),)
-        found = Deployment(
-            (Scores({"success": 0.0}),), gap, recordings=logs, probe=Recording.load(stage.folder / PROBE)
-        )
+        probe = Recording.load(stage.folder / PROBE)
+        found = Deployment((EpisodeRow({"success": 0.0}),), recordings=logs, probe=probe)
         known = Identification.load(finished(run_dir, "identify").output("parameters"))
         for name, file in judge(found, pipeline, bundle, known, stage.folder).save(stage.folder).items():
             stage.output(name, file)

@@ -8,13 +8,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sim2real.artifacts.deployment import Advice, Changed, Deployment, Drift, Gap, Replay, Scores
+from sim2real.artifacts.deployment import Changed, Deployment, Drift, EpisodeRow, Finding, Reason, Replay, Verdict
 from sim2real.artifacts.identification import Noise
 from sim2real.artifacts.recording import Recording
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode, Steps
-from sim2real.stages.deploy import replay, verdict
-from sim2real.stages.deploy.verdict import with_command
+from sim2real.stages.deploy import replay, simulation, verdict
+from sim2real.stages.deploy.verdict import decide, next_command
 from sim2real.stages.load import load_robot
 
 FRICTION = Changed("friction", "rad/s^2", 6.0, 12.0, 11.0, 13.0, 0.9, 1e-20)
@@ -37,38 +37,51 @@ def deployed(identified=0.01, here=0.01, success=1.0, simulated=1.0, drift=STEAD
     """A deployment: how far models are off, how well it went, what has changed, and how long steps took."""
     rows = (Replay("hinge", "rad", 0.1, {"identified": identified, verdict.AS_HERE: here, "hold": 0.5}, 0.01),)
     logs = tuple(Recording(Path(f"runs/pendulum/T/deploy/episode_{i}.mcap"), episode(seconds, took_s)) for i in (0, 1))
-    gap = (Gap("success", success, simulated),)
-    return Deployment((Scores({}),) * 2, gap, recordings=logs, replay=rows, drift=drift)
+    real, late = {"success": success}, [simulation.late_shares(log, BUNDLE) for log in logs]
+    table = tuple(EpisodeRow(real, {"success": simulated}, shares) for shares in late)
+    return Deployment(table, recordings=logs, replay=rows, drift=drift)
 
 
 @pytest.mark.parametrize(
     ("found", "status", "said"),
     [
-        ({}, "fine", "is the one that was identified"),
+        ({}, "fine", "success is 1.00, in simulation 1.00"),
         ({"drift": ALARM, "identified": 0.011}, "re-identify", "friction is 12 rad/s^2"),
         ({"drift": ALARM, "success": 0.7}, "re-identify", "friction is 12 rad/s^2"),
-        ({"drift": ALARM}, "fine", "errors are the expected ones"),
-        ({"identified": 0.012}, "fine", "is the one that was identified"),
+        ({"drift": ALARM}, "fine", "success is 1.00"),
+        ({"identified": 0.012}, "fine", "success is 1.00"),
         ({"identified": 0.013}, "re-identify", "expected were 0.01 rad"),
         ({"identified": 0.04}, "re-identify", "expected were 0.01 rad"),
         ({"identified": None}, "re-identify", "it diverges"),
-        ({"took_s": 0.0025}, "fine", "as fast as in training"),
-        ({"took_s": 0.004}, "fine", "and the policy succeeds"),
+        ({"took_s": 0.0025}, "fine", "success is 1.00"),
+        ({"success": None}, "fine", "no success"),
+        ({"took_s": 0.004}, "fine", "success is 1.00"),
         ({"took_s": 0.004, "success": 0.7}, "re-train",
-         "100.0% of the steps of agent take longer than the 1.0 ms of training"),
+         "100.0% of the steps of agent take longer than in training"),
         ({"took_s": 0.004, "success": None}, "re-train", "100.0% of the steps of agent take longer"),
         ({"success": 0.7}, "re-train", "success is 0.70, in simulation 1.00"),
-        ({"success": 0.85, "simulated": 0.9}, "re-train", "as in simulation"),
+        ({"success": 0.85, "simulated": 0.9}, "re-train", "success is 0.85, in simulation 0.90"),
         ({"identified": 0.5, "here": 0.2, "drift": ALARM}, "re-identify", "friction is 12 rad/s^2"),
         ({"identified": 0.5, "here": 0.4, "drift": ALARM}, "look at this joint",
          "no parameters explain how hinge moves"),
     ],
 )  # fmt: skip
 def test_one_finding_decides(found, status, said):
-    told = verdict.verdict(deployed(**found), BUNDLE)
+    found = deployed(**found)
+    told = decide(found)
     assert told.status == status
-    assert said in told.reasons[0]
-    assert told.joint == ("hinge" if status == "look at this joint" else "")
+    assert said in found.sentence(told.reasons[0])
+    assert (told.reasons[0] == Reason(Finding.UNEXPLAINED, "hinge")) == (status == "look at this joint")
+
+
+def test_a_verdict_names_what_else_was_found():
+    """A change that harms nobody, late steps of a policy that succeeds, a change that is likely and not certain."""
+    findings = lambda **found: [r.finding for r in decide(deployed(**found)).reasons]  # noqa: E731
+    assert findings(drift=ALARM) == [Finding.SUCCESS, Finding.CHANGED]
+    assert findings(took_s=0.004) == [Finding.SUCCESS, Finding.HOLDS, Finding.LATE]
+    assert findings(identified=0.02, drift=LIKELY) == [Finding.WRONG, Finding.LIKELY]
+    assert findings(success=0.5, took_s=0.004) == [Finding.LATE, Finding.SUCCESS, Finding.HOLDS]
+    assert findings(success=0.5) == [Finding.SUCCESS, Finding.HOLDS]
 
 
 @pytest.mark.parametrize(
@@ -81,12 +94,13 @@ def test_a_policy_that_fails_where_its_nodes_paused_is_not_judged(folder, paused
     paused = np.where(steps.start >= 2_000_000, steps.start + round(1e6 * paused_s), steps.start + 5_000)
     late = replace(steps, start=paused, end=paused + 1_000)
     one = replace(found.recordings[1], episode=Episode(steps={"agent": late}, messages={}, outputs={}))
-    found = replace(found, recordings=(found.recordings[0], one))
-    told = verdict.verdict(found, BUNDLE)
+    second = replace(found.episodes[1], paused_s=simulation.paused_s(one))
+    found = replace(found, episodes=(found.episodes[0], second))
+    told = decide(found)
     assert told.status == status
     if status == "not judged":
-        again = with_command(told, load_robot("pendulum"), IDENTIFIED, folder, found)
-        assert again.next == "sim2real deploy pendulum --run runs/pendulum/T"
+        again = next_command(told, found, load_robot("pendulum"), IDENTIFIED, folder)
+        assert again == "sim2real deploy pendulum --run runs/pendulum/T"
 
 
 @pytest.mark.parametrize(
@@ -117,27 +131,33 @@ def folder(tmp_path, monkeypatch):
 
 
 IDENTIFIED = SimpleNamespace(logs=[SimpleNamespace(path="record/session.mcap")], terms=None, world=None)
+OFF = {"identified": 0.02, "success": 0.5}
 OWN = "--log runs/pendulum/T/deploy/episode_0.mcap --log runs/pendulum/T/deploy/episode_1.mcap"
 
 
 @pytest.mark.parametrize(
-    ("told", "found", "command"),
+    ("found", "status", "command"),
     [
-        (Advice("fine", ()), {}, ""),
-        (Advice("re-identify", ()), {"drift": ALARM}, f"sim2real identify pendulum {OWN} --run runs/pendulum/T"),
-        (Advice("re-identify", ()), {"drift": replace(ALARM, seconds=8.0)}, "sim2real record pendulum"),
-        (Advice("re-identify", ()), {},
+        ({}, "fine", ""),
+        ({"drift": ALARM, **OFF}, "re-identify", f"sim2real identify pendulum {OWN} --run runs/pendulum/T"),
+        ({"drift": replace(ALARM, seconds=8.0), **OFF}, "re-identify", "sim2real record pendulum"),
+        (OFF, "re-identify",
          f"sim2real identify pendulum {OWN} --log runs/pendulum/T/record/session.mcap --run runs/pendulum/T"),
-        (Advice("re-train", ("success is 0.7",)), {}, "sim2real train pendulum --run runs/pendulum/T"),
-        (Advice("re-train", ("10% of the steps take longer than 1 ms",)), {},
+        ({"success": 0.7}, "re-train", "sim2real train pendulum --run runs/pendulum/T"),
+        ({"success": 0.7, "drift": replace(LIKELY, seconds=8.0)}, "re-train",
+         "sim2real train pendulum --run runs/pendulum/T"),
+        ({"success": 0.7, "took_s": 0.004}, "re-train",
          f"sim2real identify pendulum {OWN} --log runs/pendulum/T/record/session.mcap --run runs/pendulum/T"
          " && sim2real train pendulum --run runs/pendulum/T"),
-        (Advice("look at this joint", (), joint="hinge"), {}, ""),
+        ({"identified": 0.5, "here": 0.4}, "look at this joint", ""),
     ],
 )  # fmt: skip
-def test_the_command_can_be_typed(told, found, command, folder):
+def test_the_command_can_be_typed(found, status, command, folder):
     """Where the robot has changed, recordings of before are left out."""
-    assert with_command(told, load_robot("pendulum"), IDENTIFIED, folder, deployed(**found)).next == command
+    found = deployed(**found)
+    told = decide(found)
+    assert told.status == status
+    assert next_command(told, found, load_robot("pendulum"), IDENTIFIED, folder) == command
 
 
 LADEN = Drift((replace(FRICTION, name="payload", unit="kg", before=0.0, now=0.15),), 0.05, ("payload",), 20.0)
@@ -160,8 +180,10 @@ def test_what_an_arm_holds_is_identified_from_then_on(drift, terms, command, tmp
     (folder / "manifest.json").write_text('{"stage": "deploy"}')
     logs = tuple(Recording(folder.relative_to(tmp_path) / f"episode_{i}.mcap", episode()) for i in (0, 1))
     found = replace(deployed(drift=drift), recordings=logs)
-    told = with_command(Advice("re-identify", ()), load_robot("arm"), replace_terms(terms), folder, found)
-    assert sorted(told.next.split()) == sorted(command.split())
+    told = Verdict("re-identify", (), ("identify",))
+    assert sorted(next_command(told, found, load_robot("arm"), replace_terms(terms), folder).split()) == sorted(
+        command.split()
+    )
 
 
 def replace_terms(terms):
@@ -170,8 +192,12 @@ def replace_terms(terms):
 
 
 def test_a_deployment_without_an_identification_says_so(folder):
-    told = verdict.judge(deployed(), load_robot("pendulum"), BUNDLE, None, folder).advice
+    pipeline, found = load_robot("pendulum"), deployed()
+    alone = replace(found, episodes=tuple(replace(e, simulation={}) for e in found.episodes))
+    told = verdict.judge(alone, pipeline, BUNDLE, None, folder).verdict
     assert (told.status, told.next) == ("not judged", "sim2real identify pendulum --run runs/pendulum/T")
+    # A robot that is simulated in plain MuJoCo needs none.
+    assert verdict.judge(found, pipeline, BUNDLE, None, folder).verdict.status == "fine"
 
 
 def test_a_policy_that_does_not_move_is_trained_again_though_its_model_cannot_be_tested(folder, monkeypatch):
@@ -180,20 +206,25 @@ def test_a_policy_that_does_not_move_is_trained_again_though_its_model_cannot_be
 
     monkeypatch.setattr(replay, "tested", too_little)
     pipeline = load_robot("pendulum")
-    told = verdict.judge(deployed(success=0.0), pipeline, BUNDLE, IDENTIFIED, folder).advice
+    still = replace(deployed(success=0.0), replay=(), drift=None)
+    found = verdict.judge(still, pipeline, BUNDLE, IDENTIFIED, folder)
+    told = found.verdict
     assert (told.status, told.next) == ("re-train", "sim2real train pendulum --run runs/pendulum/T")
-    assert told.reasons == ("success is 0.00, in simulation 1.00", "0.0 s of them in motion")
-    assert verdict.judge(deployed(), pipeline, BUNDLE, IDENTIFIED, folder).advice.status == "not judged"
+    assert found.reasons == ("success is 0.00, in simulation 1.00", "0.0 s of them in motion")
+    moved = replace(deployed(), replay=(), drift=None)
+    assert verdict.judge(moved, pipeline, BUNDLE, IDENTIFIED, folder).verdict.status == "not judged"
 
 
-def test_the_verdict_is_in_the_artifact(tmp_path):
-    told = replace(deployed(drift=ALARM), recordings=(), advice=Advice("re-identify", ("why",), "sim2real identify"))
-    told = replace(told, episodes=(Scores({}),))
-    told.save(tmp_path)
-    from sim2real.artifacts.files import read_json
-
-    found = read_json(tmp_path / "result.json", Deployment)
-    assert (found.advice, found.drift, found.replay) == (told.advice, told.drift, told.replay)
+def test_the_verdict_is_in_the_artifact(folder):
+    """The run's folder may move, so the next command names it only when it is read."""
+    found = verdict.judge(replace(deployed(success=0.5), recordings=()), load_robot("pendulum"), BUNDLE, None, folder)
+    found.save(folder)
+    moved = folder.parents[1] / "moved" / "deploy"
+    folder.parent.rename(moved.parent)
+    read = Deployment.read(moved)
+    assert read.reasons == found.reasons
+    assert read.verdict.next == found.verdict.next.replace("pendulum/T", "pendulum/moved")
+    assert replace(read, verdict=found.verdict) == replace(found, recordings=())
 
 
 @pytest.mark.parametrize(("errors", "limit"), [([0.1] * 16, 0.1), ([0.1] * 14 + [math.nan, math.inf], math.inf)])

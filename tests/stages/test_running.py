@@ -56,7 +56,7 @@ def test_a_fine_robot_ends_the_loop(world, capsys):
         (verdict("re-identify"), ["identify", "train", "deploy"], ["deploy/episode_0.mcap", "record/session.mcap"]),
         (verdict("re-identify", drift=True), ["identify", "train", "deploy"], ["deploy/episode_0.mcap"]),
         (verdict("re-identify", drift=True, seconds=6.0), ["record", "identify", "train", "deploy"], []),
-        (verdict("re-train", reason="3% of the steps of agent take longer than 2 ms"),
+        (verdict("re-train", stages=("identify", "train")),
          ["identify", "train", "deploy"], ["deploy/episode_0.mcap", "record/session.mcap"]),
     ],
 )  # fmt: skip

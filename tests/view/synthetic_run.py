@@ -171,9 +171,8 @@ def history(seeds: int = 3) -> dict[str, Any]:
 
 def result(simulated: bool = True) -> dict[str, Any]:
     real = {"success": 0.98, "first_upright_s": 1.375, "command_rms_v": 0.97}
-    model = {"success": 1.0, "first_upright_s": 1.340, "command_rms_v": 0.46} if simulated else None
-    rows = [{"quantity": q, "real": v, "simulation": model[q] if model else None} for q, v in real.items()]
-    return {"format": 4, "episodes": [{"real": real, "simulation": model}] * 2, "gap": rows}
+    model = {"success": 1.0, "first_upright_s": 1.340, "command_rms_v": 0.46} if simulated else {}
+    return {"format": 5, "episodes": [{"real": real, "simulation": model}] * 2}
 
 
 def simulation() -> dict[str, np.ndarray]:
@@ -181,8 +180,8 @@ def simulation() -> dict[str, np.ndarray]:
     t = np.arange(1, 401) / 100
     found: dict[str, np.ndarray] = {}
     for i in range(2):
-        found |= {f"t_{i}": t, f"th_{i}": np.sin(t), f"thdot_{i}": np.cos(t), f"command_{i}": np.sin(3 * t[::2])}
-    return {**found, "t_command_1": t[::2] + 0.003}
+        found |= {f"{i}/t": t, f"{i}/th": np.sin(t), f"{i}/thdot": np.cos(t), f"{i}/command": np.sin(3 * t[::2])}
+    return {**found, "1/t_command": t[::2] + 0.003}
 
 
 def write_stage(run: Path, stage: str, folder: str | None = None, status: str = "finished") -> Path:

@@ -177,7 +177,7 @@ def test_a_deployment_without_a_simulation_is_shown(run):
 
 def test_a_dry_run_is_shown_without_a_simulation(only):
     run = only("deploy")
-    document = {"format": 4, "episodes": [{"real": {}}] * 2, "gap": [], "dry_run": True}
+    document = {"format": 5, "episodes": [{"real": {}}] * 2, "dry_run": True}
     (run / "deploy" / "result.json").write_text(json.dumps(document))
     (run / "deploy" / "simulation.npz").unlink()
     words = Page(report(run).read_text(encoding="utf-8")).words
@@ -228,7 +228,7 @@ MALFORMED = {
     ),
     "no free run": ("identify", "free_runs.npz", b"PK", "free_runs.npz is malformed"),
     "no archive": ("identify", "predictions.npz", b"PK", "predictions.npz is malformed"),
-    "no episodes": ("deploy", "result.json", b'{"episodes":[],"gap":[]}', "no episode"),
+    "no episodes": ("deploy", "result.json", b'{"episodes":[]}', "no episode"),
     "missing": ("deploy", "simulation.npz", None, "cannot read"),
     "no log": ("record", "session.mcap", b"nothing", "session.mcap"),
 }

@@ -93,7 +93,7 @@ def deployed(run_dir: Path, quantity: str) -> list[float]:
 
 def verdict(run_dir: Path) -> str:
     """Return the verdict of deploy, such as ``fine``."""
-    return json.loads(done(run_dir, "deploy").output("result").read_text())["advice"]["status"]
+    return json.loads(done(run_dir, "deploy").output("result").read_text())["verdict"]["status"]
 
 
 def rows(name: str, seeds: list[Row], goals: dict[str, str]) -> list[Row]:

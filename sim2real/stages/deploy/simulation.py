@@ -1,4 +1,4 @@
-"""The policy of a deployment in simulation: the states of both, their scores, and the gap between them."""
+"""The table of a deployment's episodes: scores on the robot and of the same policy in simulation, lateness, pauses."""
 
 from __future__ import annotations
 
@@ -9,18 +9,15 @@ from typing import Any
 import numpy as np
 
 from sim2real.artifacts.bundle import Bundle
-from sim2real.artifacts.deployment import Deployment, Gap, Scores
+from sim2real.artifacts.deployment import Deployment, EpisodeRow, mean
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode, named_leaves
 from sim2real.graph.node import TICKS_PER_S
-from sim2real.graph.timeline import Timeline
-from sim2real.graph.windows import newest_message
 from sim2real.installation import has_jax
 from sim2real.later import jax
-from sim2real.log.session import input_ages
 from sim2real.robots.loop import ACTUATOR, AGENT, SENSOR, WORLD
 from sim2real.robots.robot import Robot, as_columns, as_sent
 from sim2real.robots.training import simulation_params, training_loop
@@ -31,6 +28,8 @@ from sim2real.types import PyTree
 States = tuple[np.ndarray, dict[str, np.ndarray]]
 """Times ``(N,)`` [s], and columns: states ``(N,)``, and the commands, one a step."""
 _MIN_SIMULATIONS, _MIN_PER_EPISODE = 32, 8
+_LATENESS_PERIODS = 0.1
+"""A step is late if it exceeds the longest of training by this share of the policy's period."""
 
 
 def compare(
@@ -40,7 +39,7 @@ def compare(
     identification: Identification | None,
     duration_s: float,
 ) -> Deployment:
-    """Return the scores of a deployment beside those of simulations of the same policy.
+    """Return the table of a deployment's episodes: scores on the robot and in simulation, late steps and pauses.
 
     Scores compare states of one kind: true states if every recording has them, else states as the sensor measures
     them.
@@ -51,23 +50,39 @@ def compare(
         duration_s: Length of a simulation [s].
     """
     use_truth = all(r.true_states() is not None for r in recordings)
-    real = [_recorded(recording, robot, use_truth) for recording in recordings]
-    node = WORLD if use_truth else SENSOR
-    pairs, timeline = _simulated(robot, recordings, bundle, identification, duration_s, node)
+    pairs = _simulated(robot, recordings, bundle, identification, duration_s, WORLD if use_truth else SENSOR)
+    count, rows = len(recordings), []
+    for i, recording in enumerate(recordings):
+        real = _finite(robot.task.score(*_recorded(recording, robot, use_truth)))
+        # Simulation e is of episode e % count.
+        scores = [_finite(robot.task.score(t_s, states)) for (t_s, states), _ in pairs[i::count]]
+        simulation = {name: mean([score.get(name) for score in scores]) for name in real} if scores else {}
+        rows.append(EpisodeRow(real, simulation, late_shares(recording, bundle), paused_s(recording)))
+    # The page shows the first simulation of each episode.
+    columns = [{"t": t_s, **states} for _, (t_s, states) in pairs[:count]] or [{}] * count
+    return Deployment(tuple(rows), dict(robot.units), simulated=tuple(columns), recordings=tuple(recordings))
 
-    # Compare scores and ages. The page shows the first simulation of each episode.
-    on_robot = [_finite(robot.task.score(t, s)) for t, s in real]
-    in_simulation = [_finite(robot.task.score(t, s)) for (t, s), _ in pairs]
-    gap = [
-        _gap(quantity, *(_mean([each[quantity] for each in scores]) for scores in (on_robot, in_simulation)))
-        for quantity in on_robot[0]
-    ]
-    beside = [*in_simulation[: len(real)], *[None] * (len(real) - len(in_simulation))]
-    scores = tuple(Scores(r, s) for r, s in zip(on_robot, beside, strict=True))
-    columns: list[dict[str, np.ndarray]] = [{"t": t, **states} for _, (t, states) in pairs[: len(real)]]
-    columns += [{}] * (len(real) - len(columns))
-    gap += age_rows([r.episode for r in recordings], timeline)
-    return Deployment(scores, tuple(gap), dict(robot.units), tuple(columns), tuple(recordings))
+
+def late_shares(recording: Recording, bundle: Bundle) -> dict[str, float]:
+    """Return the share of each node's steps that take longer than the longest of training, by a tenth of a period."""
+    shares, slack_s = {}, _LATENESS_PERIODS / bundle.contract.rate_hz
+    for node, drawn_s in (bundle.episodes.drawn_s if bundle.episodes else {}).items():
+        took_s = recording.timing.steps_s.get(node, np.empty(0))
+        if drawn_s.size and took_s.size:
+            shares[node] = float(np.mean(took_s > drawn_s.max() + slack_s))
+    return shares
+
+
+def paused_s(recording: Recording) -> float:
+    """Return the time that the slowest node of an episode lost in steps of two periods or more [s]."""
+    lost_s = [0.0]
+    for steps in recording.episode.steps.values():
+        # A step that is a little late is no pause: the node returns to its schedule.
+        gaps_s = np.diff(steps.begun_s)
+        if gaps_s.size:
+            period_s = float(np.median(gaps_s))
+            lost_s.append(float(np.sum(gaps_s[gaps_s >= 2.0 * period_s] - period_s)))
+    return max(lost_s)
 
 
 def _recorded(recording: Recording, robot: Robot, use_truth: bool) -> States:
@@ -86,17 +101,17 @@ def _simulated(
     identification: Identification | None,
     duration_s: float,
     node: str,
-) -> tuple[list[tuple[States, States]], Timeline | None]:
+) -> list[tuple[States, States]]:
     """Return the simulations of a policy, in plain MuJoCo or in the compiled graph; see ``simulate``."""
     if not has_jax():
-        return [], None
+        return []
     from sim2real.robots.walking.twin import plain_episodes
     from sim2real.training.networks.policy import Policy
 
     values = None if identification is None else identification.values
     played = plain_episodes(robot, bundle.runner(None), values, range(len(recordings)), duration_s)
     if played is not None or identification is None:
-        return [(states, states) for states in played or []], None
+        return [(states, states) for states in played or []]
     policy, timing = Policy.from_weights(bundle.weights, bundle.spec), recordings[0].timing
     parameters = plausible_parameters(identification, len(recordings))
     rest = [_rest(robot, recording.episode) for recording in recordings]
@@ -120,7 +135,7 @@ def plausible_parameters(identification: Identification, episodes: int) -> list[
 
     draws = draw_robots(identification.values, identification, VariationConfig(), 1.0, np.random.default_rng(0))
     names = [p.name for p in identification.parameters if p.kind == "dynamics" and p.name in draws]
-    count = max(_MIN_SIMULATIONS, _MIN_PER_EPISODE * episodes) - episodes
+    count = max(math.ceil(_MIN_SIMULATIONS / episodes), _MIN_PER_EPISODE) * episodes - episodes
     estimates = dict(identification.values)
     return [estimates] * episodes + [estimates | {n: float(draws[n][i]) for n in names} for i in range(count)]
 
@@ -133,11 +148,10 @@ def simulate(
     duration_s: float,
     rest: Sequence[np.ndarray],
     scored_node: str,
-) -> tuple[list[tuple[States, States]], Timeline | None]:
+) -> list[tuple[States, States]]:
     """Simulate the policy from where the robot rested; steps longer than a period of the policy are not drawn.
 
-    After such a hiccup a node makes several steps at once, and the program would have to hold each of them. The ages
-    in the gap report show the hiccups on the robot.
+    After such a hiccup a node makes several steps at once, and the program would have to hold each of them.
 
     Args:
         parameters: Parameters of each simulation; simulation e is of episode ``e % len(rest)``.
@@ -145,8 +159,8 @@ def simulate(
         scored_node: The node whose states are scored: the world, or the sensor.
 
     Returns:
-        For each simulation the states of the scored node and those of the sensor, and the timelines; empty and None if
-        the timing is too short to draw from.
+        For each simulation the states of the scored node and those of the sensor; empty if the timing is too short to
+        draw from.
     """
     from sim2real.graph.schedule import draw
     from sim2real.graph.windows import make_room
@@ -158,7 +172,7 @@ def simulate(
         computation, hiccups = timing.computation(1.0 / robot.rate_hz)
     except Sim2RealError as error:
         note(f"warning: nothing to compare with: {error.args[0]}")
-        return [], None
+        return []
     if hiccups:
         counts = ", ".join(f"{count} of {name}" for name, count in hiccups.items())
         note(f"the simulation omits steps that took longer than a period of the policy: {counts}")
@@ -199,47 +213,9 @@ def simulate(
         t_s = (own + 1) / rate if node == WORLD else vertices[node].start[e][own] / TICKS_PER_S
         return t_s, {**columns, "t_command": command_s}
 
-    return [(states(e, scored_node), states(e, SENSOR)) for e in range(count)], timeline
-
-
-# -- the gap
-
-
-def age_rows(episodes: Sequence[Episode], timeline: Timeline | None) -> list[Gap]:
-    """Return rows of the gap report: the ages of the data that policy and actuator use, on the robot and simulated."""
-    rows = []
-    for reader in (AGENT, ACTUATOR):
-        measured = [input_ages(e, reader) for e in episodes]
-        for name in measured[0]:
-            ages = [a[name][np.isfinite(a[name])] for a in measured if name in a]
-            drawn = None
-            if timeline is not None and (reader, name) in timeline.edges:
-                drawn = _drawn_ages(timeline, reader, name)
-            for label, q in (("p50", 0.5), ("max", 1.0)):
-                real = _mean([float(np.quantile(a, q)) for a in ages if a.size])
-                simulated = None if drawn is None else float(np.mean(np.quantile(drawn, q, axis=1)))
-                rows.append(_gap(f"age_of_{name}_in_{reader}_{label}_s", real, simulated))
-    return rows
-
-
-def _drawn_ages(timeline: Timeline, reader: str, name: str) -> np.ndarray:
-    """Return the age of the newest message at each step of drawn timelines, after the first message ``(E, N)`` [s]."""
-    edge, vertex = timeline.edges[reader, name], timeline.vertices[reader]
-    newest = newest_message(edge, vertex)[:, : int(vertex.count.min())]
-    first = int((newest < 0).sum(axis=1).max())
-    sent = np.take_along_axis(timeline.vertices[edge.sender].end, newest.clip(0), axis=1)
-    return (vertex.start[:, : newest.shape[1]] - sent)[:, first:] / TICKS_PER_S
+    return [(states(e, scored_node), states(e, SENSOR)) for e in range(count)]
 
 
 def _finite(score: Mapping[str, float]) -> dict[str, float | None]:
     """Return None for a score that does not exist, such as the time to a goal that was not reached."""
     return {name: value if math.isfinite(value) else None for name, value in score.items()}
-
-
-def _gap(quantity: str, real: float | None, simulated: float | None) -> Gap:
-    return Gap(quantity, real, simulated)
-
-
-def _mean(values: list[float | None]) -> float | None:
-    present = [v for v in values if v is not None]
-    return float(np.mean(present)) if present else None

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sim2real.artifacts.bundle import Bundle
-from sim2real.artifacts.deployment import PROBE, Deployment, Scores, log_of
+from sim2real.artifacts.deployment import PROBE, Deployment, EpisodeRow, log_of
 from sim2real.artifacts.identification import ROUND_TRIP, Identification
 from sim2real.artifacts.recording import TRUTH, Recording
 from sim2real.artifacts.run import StageFolder, finished, newest, open_stage, sha256
@@ -79,12 +79,11 @@ def _deployed(
     logs = [log_of(folder, i) for i in range(config.episodes)]
     following = None if identification is None else _following(robot, identification)
     summaries = run_episodes(robot, bundle, config, logs, following)
-    recordings = [Recording.load(log, folder / TRUTH) for log in logs]
+    recordings = tuple(Recording.load(log) for log in logs)
     if config.dry_run:
         # The robot did not move: there are no scores and no gap.
-        scores, simulated = tuple(Scores({}) for _ in recordings), tuple({} for _ in recordings)
-        units, sessions = dict(robot.units), tuple(summaries)
-        return Deployment(scores, (), units, simulated, tuple(recordings), dry_run=True, summary=sessions)
+        nothing = tuple(EpisodeRow({}) for _ in recordings), dict(robot.units)
+        return Deployment(*nothing, dry_run=True, recordings=recordings, summary=tuple(summaries))
 
     # Simulate the same. JAX programs are imported and compiled only now, when the robot is at rest.
     from sim2real.stages.deploy.simulation import compare
@@ -92,11 +91,11 @@ def _deployed(
 
     world = None if identification is None else identification.world
     deployment = compare(in_world(robot, world), recordings, bundle, identification, config.duration_s)
-    probe = folder / PROBE
-    deployment = replace(deployment, probe=Recording.load(probe, folder / TRUTH) if probe.is_file() else None)
+    probe = Recording.load(folder / PROBE) if (folder / PROBE).is_file() else None
 
     # Judge the model and the policy.
-    return replace(judge(deployment, robot, bundle, identification, folder), summary=tuple(summaries))
+    deployment = replace(deployment, probe=probe, summary=tuple(summaries))
+    return judge(deployment, robot, bundle, identification, folder)
 
 
 def run(robot: RecordedRobot, config: DeployConfig, root: Path, run_dir: Path | None) -> StageFolder:
@@ -166,10 +165,10 @@ def _show(deployment: Deployment) -> None:
     for content in tables:
         if content.rows:
             print(artifact_table(content))
-    if (advice := deployment.advice) is not None:
-        note("\n  ".join([f"verdict: {advice.status}", *advice.reasons]))
-        if advice.next:
-            note(f"next: {advice.next}")
+    if (verdict := deployment.verdict) is not None:
+        note("\n  ".join([f"verdict: {verdict.status}", *deployment.reasons]))
+        if verdict.next:
+            note(f"next: {verdict.next}")
 
 
 def _summary_lines(deployment: Deployment, last: Mapping[str, Json]) -> dict[str, Json]:
