@@ -89,10 +89,10 @@ def quiet_and_impatient(monkeypatch):
 
 
 def test_random_lines():
-    ends, readings = check(range(300))
+    ends, readings = check(range(150))
     # The lines are of all kinds: most readings are made, and buses are lost.
-    assert readings > 1500
-    assert min(ends["fine"], ends["HardwareLost"]) > 30
+    assert readings > 750
+    assert min(ends["fine"], ends["HardwareLost"]) > 15
     assert len(IDS) == 3
 
 
