@@ -86,7 +86,7 @@ def _run_command(arguments: list[str], signals: SignalHandling) -> int:
         _dispatch(arguments)
         sys.stdout.flush()
     except Sim2RealError as error:
-        return _failed(error)
+        return _failed(error, arguments)
     except BrokenPipeError:  # the reader of our output has closed it, as `head` does: no error
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return ERROR
@@ -100,7 +100,7 @@ def _run_command(arguments: list[str], signals: SignalHandling) -> int:
         return _ended_by(signals.received) if signals.received else _refused(error)
     except ModuleNotFoundError as error:
         missing = not_installed(error)
-        return _failed(missing) if missing else _unexpected(error)
+        return _failed(missing, arguments) if missing else _unexpected(error)
     except Exception as error:
         if signals.received:  # an extension that is interrupted while it is imported raises ImportError
             return _ended_by(signals.received)
@@ -136,11 +136,12 @@ def _dispatch(arguments: list[str]) -> None:
 # -- how a command ends
 
 
-def _failed(error: Sim2RealError) -> int:
+def _failed(error: Sim2RealError, arguments: Sequence[str]) -> int:
     """Print the error's message, notes and hint; return its exit code."""
     _print_traceback()
     # Notes name nodes, and what else failed during the clean-up; the hint comes last.
-    hint = error.hint or ("see `sim2real COMMAND --help`" if isinstance(error, UsageError) else None)
+    command = f"{arguments[0]} " if arguments and arguments[0] in COMMANDS else ""
+    hint = error.hint or (f"see `sim2real {command}--help`" if isinstance(error, UsageError) else None)
     _complain(f"error: {error.args[0]}", *_notes(error), *([f"\nhint: {hint}"] if hint else []))
     return error.exit_code
 

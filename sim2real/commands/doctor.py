@@ -49,6 +49,8 @@ def doctor(command: str, arguments: list[str]) -> None:
 
 def _answer(config: DoctorConfig) -> tuple[dict[str, Any], list[str], bool]:
     """Return the answer as data and as lines, and whether something is wrong; write the page or the bundle."""
+    if config.policy is None or (config.log is None and config.mjcf is None and config.bundle is None):
+        raise UsageError("doctor needs --policy, and --log of the robot or --mjcf of the model, or both")
     from sim2real.doctor.before import examine
     from sim2real.doctor.contract import read_policy, write_bundle
     from sim2real.doctor.diagnosis import diagnose
@@ -56,8 +58,6 @@ def _answer(config: DoctorConfig) -> tuple[dict[str, Any], list[str], bool]:
     from sim2real.doctor.plant import Drives, driven_joints
     from sim2real.doctor.report import write_diagnosis
 
-    if config.policy is None or (config.log is None and config.mjcf is None and config.bundle is None):
-        raise UsageError("doctor needs --policy, and --log of the robot or --mjcf of the model, or both")
     say = note if config.json else wrote
     config.out.mkdir(parents=True, exist_ok=True)
     joints = tuple(driven_joints(config.mjcf)) if config.mjcf else ()

@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from sim2real.commands import flags
-from sim2real.errors import Sim2RealError, UsageError
+from sim2real.errors import UsageError
 from sim2real.runtime import compilation_cache
 from sim2real.stages.flag import Flag
-from sim2real.stages.load import available, folder_of, load_robot, shipped_policy
+from sim2real.stages.load import load_robot
+from sim2real.stages.shared.find_run import find_bundle, find_parameters
 
 Format = Literal["mjcf", "mjlab", "isaaclab", "json", "card", "policy"]
 FILES = {"mjcf": "identified.xml", "mjlab": "mjlab.py", "isaaclab": "isaaclab.py", "json": "identified.json",
@@ -23,7 +24,7 @@ EXAMPLE = "run_policy.py"
 class ExportConfig:
     """Write the estimates as a model of another simulator, or a policy for a machine that has numpy alone."""
 
-    source: Annotated[str | None, Flag("RUN|PIPELINE|FILE", positional=True)] = None
+    source: Annotated[str, Flag("RUN|PIPELINE|FILE", positional=True, needed=True)] = ""
     """A run folder, a pipeline, whose newest result is taken, a parameters.json, or the folder of a policy bundle."""
     to: Format = "mjcf"
     """Format: a model for MuJoCo, a Python file for mjlab or for Isaac Lab, everything as JSON; a model card: a folder
@@ -52,11 +53,6 @@ def run(config: ExportConfig) -> Path:
     from sim2real.stages.export import write_export  # imports JAX
     from sim2real.stages.terminal.console import wrote
 
-    if config.source is None:
-        raise UsageError(
-            f"export needs a run folder, a pipeline or a file. Pipelines: {', '.join(sorted(available()))}",
-            hint="sim2real export PIPELINE --to mjcf",
-        )
     if config.to == "policy":
         return _export_policy(find_bundle(config.source, config.runs), config.out)
     file = find_parameters(config.source, config.runs)
@@ -66,51 +62,6 @@ def run(config: ExportConfig) -> Path:
     write_export(identification, robot, config.to, out, file.resolve().parent.parent)
     wrote(out)
     return out
-
-
-def find_parameters(source: str, runs: Path) -> Path:
-    """Return the file of the identification that a text names: a file, a stage folder, a pipeline or a run."""
-    from sim2real.artifacts.identification import PARAMETERS
-
-    path = Path(source)
-    if path.is_file():
-        return path
-    return path / PARAMETERS if (path / PARAMETERS).is_file() else _output(source, runs, "identify", "parameters")
-
-
-def find_bundle(source: str, runs: Path) -> Path:
-    """Return the folder of the policy bundle that a text names: a bundle, a stage folder, a pipeline or a run.
-
-    A pipeline without a training of its own gives the bundle that it ships.
-    """
-    from sim2real.artifacts.bundle import BUNDLE
-    from sim2real.policy.bundle import CONTRACT
-
-    for folder in (Path(source), Path(source) / BUNDLE):
-        if (folder / CONTRACT).is_file():
-            return folder
-    if Path(source).is_file():
-        raise UsageError(
-            f"{source} is a file, where the folder of a policy bundle is expected: policy.json says what the network's "
-            "inputs and outputs mean, which a network alone does not",
-            hint="a policy of another library becomes a bundle with sim2real.policy.bundle.save_bundle",
-        )
-    try:
-        return _output(source, runs, "train", "bundle")
-    except Sim2RealError:
-        if source in available() and (shipped := shipped_policy(folder_of(source))) is not None:
-            return shipped
-        raise
-
-
-def _output(source: str, runs: Path, stage: str, name: str) -> Path:
-    """Return an output of a stage: the newest of a pipeline, or of a run."""
-    from sim2real.artifacts.run import newest, pipeline_of
-    from sim2real.stages.shared.find_run import find_run, warn_of_stale
-
-    run_dir = None if source in available() else find_run(runs, source)
-    pipeline = source if run_dir is None else pipeline_of(run_dir)
-    return warn_of_stale(newest(runs, pipeline, stage, run_dir)).output(name)
 
 
 def _export_policy(bundle: Path, out: Path | None) -> Path:

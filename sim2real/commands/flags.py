@@ -85,7 +85,7 @@ def parse(default: Config, arguments: Sequence[str], prog: str, *examples: str, 
         text: What the command does; default: the first line of the configuration's docstring.
 
     Raises:
-        UsageError: A flag is unknown, or a value does not fit.
+        UsageError: A flag is unknown, a value does not fit, or one is missing.
         SystemExit: With code 0 after ``--help``.
     """
     options = list(_options(default))
@@ -108,7 +108,12 @@ def parse(default: Config, arguments: Sequence[str], prog: str, *examples: str, 
             values[option.path] = words
         elif words:
             values[option.path] = _value(option, words, prog)
-    return _replaced(default, values, ())
+    config = _replaced(default, values, ())
+    if missing := next((o for o in options if o.mark.needed and o.path not in values), None):
+        flag = "" if missing.mark.positional else f"{missing.name} "
+        what = f"{flag}{_placeholder(missing)}"
+        raise UsageError(f"{prog.removeprefix('sim2real ')} needs {what}", hint=f"sim2real {examples[0]}")
+    return config
 
 
 def _options(
@@ -225,8 +230,8 @@ def _unknown(unknown: Sequence[str], options: Sequence[_Option], prog: str) -> U
         return UsageError(f"unexpected argument {unknown[0]!r}", hint=f"see `{prog} --help`")
     names = [option.name for option in options if not option.mark.positional]
     available = f". Available: {', '.join(names)}" if len(names) <= _MAX_LISTED_FLAGS else ""
-    close = difflib.get_close_matches(written[0], names, n=1)
-    guess = f"did you mean {close[0]}? " if close else ""
+    close = difflib.get_close_matches(written[0].lstrip("-"), [name[2:] for name in names], n=1)
+    guess = f"did you mean --{close[0]}? " if close else ""
     if written[0] in [option.name for option in options if option.mark.positional]:
         guess = f"write its value without {written[0]}. "
     hint = f"{guess}`{prog} --help-all` lists all flags"

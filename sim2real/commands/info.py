@@ -107,26 +107,18 @@ def _commands(name: str) -> str:
 
 
 def run(run_dir: Path) -> str:
-    """Return the stages of a run, their inputs and outputs."""
-    # One row for each attempt of a stage, and one for each of its files.
-    rows, files = [], []
+    """Return the attempts of the stages of a run, and their files; each manifest has the rest."""
+    rows = []
     stale = {s.newest.folder.name: s.stale for s in stage_status(run_dir).values() if s.stale}
     for stage in STAGES:
         for attempt in attempts(run_dir, stage):
             manifest, name = attempt.manifest, attempt.folder.name
             status = "out of date" if name in stale else manifest.status
-            sha = (manifest.git or {}).get("sha") or "-"
-            rows.append([name, status, manifest.exit_code, manifest.started[:19], manifest.duration_s, sha[:10]])
-            for kind, sources in (("input", manifest.inputs), ("output", manifest.outputs)):
-                files += [[name, kind, n, source.path, source.sha256[:10]] for n, source in sources.items()]
-    return "\n\n".join(
-        [
-            f"run  {shown(run_dir)}",
-            table(rows, ["stage", "status", "exit", "started (UTC)", "duration [s]", "git"]),
-            *(["\n".join(f"out of date: {why}" for why in stale.values())] if stale else []),
-            table(files, ["stage", "", "name", "path", "sha256"]),
-        ]
-    )
+            files = ", ".join(source.path for source in manifest.outputs.values())
+            rows.append([name, status, manifest.started[:19], manifest.duration_s, files])
+    head = f"run  {shown(run_dir)}"
+    stages = table(rows, ["stage", "status", "started (UTC)", "duration [s]", "files"])
+    return "\n\n".join([head, stages, *(f"out of date: {why}" for why in stale.values())])
 
 
 def log(path: Path) -> str:

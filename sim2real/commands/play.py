@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from sim2real.commands import flags
-from sim2real.commands.export import find_bundle
 from sim2real.errors import UsageError
 from sim2real.stages.flag import WINDOW, Flag
 from sim2real.stages.load import available, load_robot
+from sim2real.stages.shared.find_run import find_bundle
 
 if TYPE_CHECKING:
     import numpy as np
@@ -26,7 +26,7 @@ _SPACE = 32
 class PlayConfig:
     """Let a policy walk on a twin in C MuJoCo, with delays and noise."""
 
-    source: Annotated[str | None, Flag("RUN|PIPELINE|BUNDLE", positional=True)] = None
+    source: Annotated[str, Flag("RUN|PIPELINE|BUNDLE", positional=True, needed=True)] = ""
     """A bundle's folder, a run folder, or a pipeline, whose newest training is taken, or its shipped bundle."""
     command: tuple[float, float, float] = (0.6, 0.0, 0.0)
     """Velocity: forwards, to the left [m/s], yaw rate [rad/s]."""
@@ -71,8 +71,6 @@ def run(config: PlayConfig) -> "Walked":
     from sim2real.robots.walking.twin import HiddenTwin, Twin, walk
     from sim2real.stages.terminal.console import note, progress, wrote
 
-    if config.source is None:
-        raise UsageError("play needs a pipeline, a run or a bundle", hint="sim2real play go2")
     # Find the policy, and the robot that it is for.
     folder, pipelines = find_bundle(config.source, config.runs), available()
     names = (config.source, *(p.name for p in folder.resolve().parents))

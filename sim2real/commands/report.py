@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated
 from sim2real.commands import flags
 from sim2real.errors import UsageError
 from sim2real.stages.flag import WINDOW, Flag, is_viewer
-from sim2real.stages.load import available
 from sim2real.stages.shared.find_run import find_run
 
 if TYPE_CHECKING:
@@ -25,7 +24,7 @@ COMPARISON = "compare.html"
 class ReportConfig:
     """Write a run as one HTML page, show it in the Rerun viewer, or compare runs of one robot."""
 
-    targets: Annotated[tuple[str, ...], Flag("RUN|PIPELINE...", positional=True)] = ()
+    targets: Annotated[tuple[str, ...], Flag("RUN|PIPELINE...", positional=True, needed=True)] = ()
     """A run folder, its name, a folder of a stage in it, or a pipeline, whose newest run is taken. Several: their
     parameters, errors and success side by side."""
     rerun: Annotated[str | None, Flag("[web|FILE.rrd]", alone=WINDOW)] = None
@@ -59,16 +58,10 @@ def report_command(command: str, arguments: list[str]) -> None:
     """``sim2real report RUN|PIPELINE... [FLAGS]``."""
     examples = ("report pendulum", "report pendulum --rerun", "report runs/NAME/MONDAY runs/NAME/FRIDAY")
     config = flags.parse(ReportConfig(), arguments, f"sim2real {command}", *examples)
-    targets: tuple[str, ...] = config.targets
-    if not targets:
-        names = ", ".join(sorted(available())) or "none"
-        raise UsageError(
-            f"{command} needs a run folder or a pipeline. Pipelines: {names}", hint=f"see `sim2real {command} --help`"
-        )
-    if len(targets) > 1:
+    if len(config.targets) > 1:
         compare(config)
         return
-    run_dir = find_run(config.runs, *targets)
+    run_dir = find_run(config.runs, *config.targets)
     if config.rerun:
         _show(run_dir, config.rerun, config.follow)
         return

@@ -1,5 +1,6 @@
 """Flags of configurations: how a field appears on the command line, and flags of several stages. Imports no JAX."""
 
+import math
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -13,6 +14,7 @@ class Flag:
     Attributes:
         metavar: Placeholder of the value in ``--help``; "": the type's.
         positional: Whether the value stands without a flag.
+        needed: Whether a command refuses to run without it.
         flat: Whether the flags of a nested configuration have no prefix.
         also: A second name, such as ``--like``.
         alone: Value of a flag that is written without one; None: it needs a value.
@@ -20,6 +22,7 @@ class Flag:
 
     metavar: str = ""
     positional: bool = False
+    needed: bool = False
     flat: bool = False
     also: str = ""
     alone: str | None = None
@@ -50,3 +53,9 @@ def check_seed(seed: int) -> None:
     """Refuse a value that is no seed."""
     if not 0 <= seed < 2**31:
         raise UsageError(f"seed must lie in [0, 2**31), got {seed}")
+
+
+def check_rate(rate_hz: float | None) -> None:
+    """Refuse a value that is no rate."""
+    if rate_hz is not None and not 0.0 < rate_hz < math.inf:
+        raise UsageError(f"a rate must lie above 0, in samples per second, got {rate_hz}", hint="--rate-hz 100")

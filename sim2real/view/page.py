@@ -93,6 +93,7 @@ def write_page(
         notes=notes,
     )
     # Write a draft and rename it, as a rename is atomic.
+    path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(f".{path.name}.tmp")
     draft.write_text(text, encoding="utf-8", errors="replace")  # such as half a surrogate pair in the name of a file
     os.replace(draft, path)

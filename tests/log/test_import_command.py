@@ -72,7 +72,7 @@ def test_a_mapping_of_ones_own_a_range_and_a_name_for_the_log(workplace, capsys)
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        ([], "import needs a file"),
+        ([], "import needs FILE"),
         (["one.npz"], "write a mapping"),
         (["one.npz", "--pipeline", "no_such_robot"], "no_such_robot"),
         (["one.npz", "--pipeline", "pendulum"], "hinge"),

@@ -12,9 +12,9 @@ from sim2real import cli, errors
 from sim2real.artifacts import run as run_folder
 from sim2real.artifacts.identification import Estimate, Identification, Judgement
 from sim2real.artifacts.posterior import Posterior
-from sim2real.commands.export import find_parameters
 from sim2real.identification.export import terms
 from sim2real.stages.load import load_robot
+from sim2real.stages.shared.find_run import find_parameters
 
 
 def identified(pipeline, status="accepted", **values):
@@ -122,7 +122,7 @@ def test_an_identification_without_intervals_is_refused(arm, here, capsys, statu
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ([], "needs a run folder, a pipeline or a file"),
+        ([], "export needs RUN|PIPELINE|FILE"),
         (["no_such"], "there is no file, pipeline or run 'no_such'"),
         (["arm"], "no finished 'identify' of pipeline 'arm'"),
         (["arm", "--to", "gazebo"], "gazebo"),

@@ -52,11 +52,12 @@ def test_an_error_above_the_expected_one_is_named_and_fails(rows, changes, holds
     assert found.holds == holds
     assert named in found.verdict
     monkeypatch.setattr(stage.Identification, "load", lambda path: Identification("arm", (), Judgement("", ()), ()))
+    monkeypatch.setattr(stage, "find_parameters", lambda source, runs: Path(source) / "parameters.json")
     monkeypatch.setattr(stage, "load_robot", lambda name: load_robot("arm"))
     monkeypatch.setattr(stage, "open_recording", lambda *given: None)
     monkeypatch.setattr(stage, "score", lambda *given: found)
     for as_json in (False, True):
-        assert stage.run(ValidateConfig(Path("run"), ("b.mcap",), json=as_json)) == holds
+        assert stage.run(ValidateConfig("run", ("b.mcap",), json=as_json)) == holds
     out, err = capsys.readouterr()
     verdict, following, *_ = err.splitlines()
     assert verdict == f"verdict: {found.verdict}"

@@ -6,14 +6,14 @@ from pathlib import Path
 from typing import Annotated
 
 from sim2real.errors import UsageError
-from sim2real.stages.flag import Flag
+from sim2real.stages.flag import Flag, check_rate
 
 
 @dataclass(frozen=True)
 class ImportConfig:
     """Turn files of other recorders into logs, one for each file."""
 
-    files: Annotated[tuple[Path, ...], Flag("FILE...", positional=True)] = ()
+    files: Annotated[tuple[Path, ...], Flag("FILE...", positional=True, needed=True)] = ()
     """Files of other recorders: npz, JSON, CSV, MCAP or the folder of a ROS 2 bag, or a LeRobot data set."""
     mapping: Path | None = None
     """TOML file that maps signals to fields; default: the pipeline's import.toml, or one is proposed."""
@@ -46,6 +46,7 @@ class ImportConfig:
 
     def __post_init__(self) -> None:
         """Check what can be checked before a file is read."""
+        check_rate(self.rate_hz)
         if self.samples is not None and not re.fullmatch(r"(-?\d+)?:(-?\d+)?", self.samples):
             raise UsageError(
                 f"samples must be a range A:B of whole numbers, got {self.samples!r}", hint="such as 0:20000 or 500:"
@@ -59,13 +60,6 @@ class ImportConfig:
                 f"unknown unit {self.unit!r}. Available: rad, deg, rev, mrad, m, mm, counts:N, hundredths",
                 hint="counts:4096 for an encoder with 4096 counts a turn",
             )
-
-    @property
-    def sources(self) -> tuple[Path, ...]:
-        """The files, at least one."""
-        if not self.files:
-            raise UsageError("import needs a file of another recorder", hint="sim2real import FILE... --pipeline NAME")
-        return self.files
 
     @property
     def selection(self) -> slice | None:

@@ -32,7 +32,7 @@ def run(config: ImportConfig) -> None:
         UsageError: When a file or the mapping cannot be read, they do not fit each other, or the proposed mapping has
             open questions.
     """
-    sets = [open_tables(path, config.episode) for path in config.sources]
+    sets = [open_tables(path, config.episode) for path in config.files]
     if config.together and len(sets) > 1:
         sets = [[joined([table for tables in sets for table in tables])]]
     if config.out is not None and len(sets[0]) > 1:

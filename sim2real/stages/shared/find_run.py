@@ -1,4 +1,4 @@
-"""The run of a user's text: its path, its name, a stage folder in it, or a pipeline's newest run."""
+"""What a user's text names: a run, its identification or policy; by path, by name, or the newest of a pipeline."""
 
 from __future__ import annotations
 
@@ -6,9 +6,19 @@ import difflib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sim2real.artifacts.run import STAGES, StageFolder, attempts, finished, newest, run_folders, stage_status, why_stale
+from sim2real.artifacts.run import (
+    STAGES,
+    StageFolder,
+    attempts,
+    finished,
+    newest,
+    pipeline_of,
+    run_folders,
+    stage_status,
+    why_stale,
+)
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.stages.load import available
+from sim2real.stages.load import available, folder_of, shipped_policy
 from sim2real.stages.terminal.console import note
 
 if TYPE_CHECKING:
@@ -36,6 +46,48 @@ def find_run(root: Path, target: str | Path, pipeline: str | None = None) -> Pat
     if pipeline is None and (folders := run_folders(root, str(target))):
         return next((f for f in reversed(folders) if any(finished(f, stage) for stage in STAGES)), folders[-1])
     raise _nothing_there(root, str(target))
+
+
+def find_parameters(source: str, runs: Path) -> Path:
+    """Return the file of the identification that a text names: a file, a stage folder, a pipeline or a run."""
+    from sim2real.artifacts.identification import PARAMETERS
+
+    path = Path(source)
+    if path.is_file():
+        return path
+    return path / PARAMETERS if (path / PARAMETERS).is_file() else _output(source, runs, "identify", "parameters")
+
+
+def find_bundle(source: str, runs: Path) -> Path:
+    """Return the folder of the policy bundle that a text names: a bundle, a stage folder, a pipeline or a run.
+
+    A pipeline without a training of its own gives the bundle that it ships.
+    """
+    from sim2real.artifacts.bundle import BUNDLE
+    from sim2real.policy.bundle import CONTRACT
+
+    for folder in (Path(source), Path(source) / BUNDLE):
+        if (folder / CONTRACT).is_file():
+            return folder
+    if Path(source).is_file():
+        raise UsageError(
+            f"{source} is a file, where the folder of a policy bundle is expected: policy.json says what the network's "
+            "inputs and outputs mean, which a network alone does not",
+            hint="a policy of another library becomes a bundle with sim2real.policy.bundle.save_bundle",
+        )
+    try:
+        return _output(source, runs, "train", "bundle")
+    except Sim2RealError:
+        if source in available() and (shipped := shipped_policy(folder_of(source))) is not None:
+            return shipped
+        raise
+
+
+def _output(source: str, runs: Path, stage: str, name: str) -> Path:
+    """Return an output of a stage: the newest of a pipeline, or of a run."""
+    run_dir = None if source in available() else find_run(runs, source)
+    pipeline = source if run_dir is None else pipeline_of(run_dir)
+    return warn_of_stale(newest(runs, pipeline, stage, run_dir)).output(name)
 
 
 def newest_recording(robot: RecordedRobot, root: Path, run_dir: Path | None = None) -> StageFolder:
@@ -70,15 +122,18 @@ def _nothing_there(root: Path, target: str) -> UsageError:
     pipelines = sorted(available())
     names = [f"{f.parent.name}/{f.name}" for p in sorted(Path(root).glob("*")) for f in run_folders(root, p.name)]
     listed = f"Pipelines: {', '.join(pipelines) or 'none'}. Runs in {root}: {', '.join(names[-5:]) or 'none'}"
-    if Path(target).is_file():
+    if Path(target).exists():
+        what = "a file" if Path(target).is_file() else "a folder without a stage of a run"
         return UsageError(
-            f"{target} is a file, where a run, a folder of a stage, or a pipeline is expected. {listed}",
+            f"{target} is {what}, where a run, a folder of a stage, or a pipeline is expected. {listed}",
             hint="name the folder of the run",
         )
     if target in pipelines:
         hint = f"make a run with `sim2real run {target}`, or name another folder with --runs DIR"
     elif close := difflib.get_close_matches(target, [*pipelines, *(n.partition("/")[2] for n in names)], n=1):
         hint = f"did you mean {close[0]}?"
+    elif Path(target).suffix or Path(target).name != target:
+        hint = "check the path"
     else:
         hint = "make a run with `sim2real run PIPELINE`, or name another folder with --runs DIR"
     return UsageError(f"there is no file, pipeline or run {target!r}. {listed}", hint=hint)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from sim2real.stages.flag import Flag
+from sim2real.stages.flag import Flag, check_rate
 
 
 @dataclass(frozen=True)
@@ -39,3 +39,7 @@ class RobotFlags:
     joint."""
     as_told: bool = False
     """Keep names, order and signs of the file or the mapping, even if the data contradicts them or is ambiguous."""
+
+    def __post_init__(self) -> None:
+        """Check the flags."""
+        check_rate(self.rate_hz)

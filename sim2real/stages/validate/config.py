@@ -11,9 +11,11 @@ from sim2real.stages.flag import Flag
 class ValidateConfig:
     """Score an identification on later logs."""
 
-    parameters: Annotated[Path | None, Flag("PARAMETERS", positional=True)] = None
-    """parameters.json, or the folder of an identification."""
-    log: Annotated[tuple[str, ...], Flag("FILE ...")] = ()
+    parameters: Annotated[str, Flag("RUN|PIPELINE|PARAMETERS", positional=True, needed=True)] = ""
+    """parameters.json, the folder of an identification, a run, or a pipeline, whose newest identification is taken."""
+    log: Annotated[tuple[str, ...], Flag("FILE ...", needed=True)] = ()
     """Later logs."""
     json: bool = False
     """Print JSON instead of tables."""
+    runs: Path = Path("runs")
+    """Folder of all runs."""

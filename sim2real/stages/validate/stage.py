@@ -36,6 +36,7 @@ from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.load import AnyRobot, defaults_of, load_robot, robot_of
 from sim2real.stages.shared import arguments
 from sim2real.stages.shared.arguments import AnyIdentification, AnyRecording, open_recording
+from sim2real.stages.shared.find_run import find_parameters
 from sim2real.stages.shared.identification import command, identified_robot, side_by_side, usable, was_fitted
 from sim2real.stages.terminal.console import artifact_table, note, progress
 from sim2real.stages.validate.config import ValidateConfig
@@ -119,13 +120,10 @@ def run(config: ValidateConfig) -> bool:
         Whether it holds: each log was scored, no baseline is as good, and no error is above the expected one.
 
     Raises:
-        UsageError: There are no parameters or no log, or no log can be scored.
+        UsageError: There are no parameters, or no log can be scored.
     """
-    if config.parameters is None or not config.log:
-        raise UsageError(
-            "validate needs parameters and a log", hint="sim2real validate RUN/identify/parameters.json --log new.mcap"
-        )
-    identification = Identification.load(config.parameters)
+    file = find_parameters(config.parameters, config.runs)
+    identification = Identification.load(file)
     robot = load_robot(identification.pipeline)
     # A log that cannot be read is named, and the others are scored.
     logs, refused = [], dict[str, str]()
@@ -143,7 +141,7 @@ def run(config: ValidateConfig) -> bool:
         print(to_json(document).decode())
         return found.holds
     note(f"verdict: {found.verdict}")
-    note(f"next: {_following(found, identification, robot, config)}")
+    note(f"next: {_following(found, identification, robot, file.parent, config.log)}")
     print(artifact_table(found.rows(), _SHOWN))
     for log, joints in found.resting.items():
         note(f"{', '.join(joints)} does not move in {log}, which tests nothing about it")
@@ -154,14 +152,14 @@ def run(config: ValidateConfig) -> bool:
     return found.holds
 
 
-def _following(found: Validation, identification: Identification, robot: RecordedRobot, config: ValidateConfig) -> str:
+def _following(
+    found: Validation, identification: Identification, robot: RecordedRobot, folder: Path, log: Sequence[str]
+) -> str:
     """Return the next command, or what to do where none follows."""
-    folder = Path(config.parameters or "")
-    folder = folder if folder.is_dir() else folder.parent
     if found.exceeded or found.beaten:
         # An identification from all logs covers the motion of the new ones.
         fitted = [os.path.relpath(folder.parent / source.path) for source in identification.logs]
-        logs = tuple(dict.fromkeys([*fitted, *config.log]))
+        logs = tuple(dict.fromkeys([*fitted, *log]))
         again = command(robot, replace(defaults_of(robot).identify, log=logs), Path("runs"))
         return f"if the robot is still the same, identify from all of these logs: {again}"
     if found.identified != ACCEPTED:
