@@ -17,8 +17,7 @@ from sim2real.artifacts.paths import shown
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run import STAGES, StageFolder, finished, stage_status
 from sim2real.artifacts.summary import Shown
-from sim2real.commands.run import RunFlags
-from sim2real.commands.stages import module_of
+from sim2real.commands.stages import RunFlags, module_of
 from sim2real.errors import DelayChanged, Sim2RealError, UsageError
 from sim2real.robots.robot import RecordedRobot, Robot
 from sim2real.stages.config import DeployConfig, IdentifyConfig, RecordConfig, TrainConfig

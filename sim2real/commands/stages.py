@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import sys
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Generic, TypeVar
@@ -15,6 +15,7 @@ from sim2real.commands import flags
 from sim2real.errors import ERROR, UsageError
 from sim2real.installation import has_jax
 from sim2real.runtime import compilation_cache
+from sim2real.stages.config import DeployConfig, IdentifyConfig, RecordConfig, TrainConfig
 from sim2real.stages.flag import Flag
 from sim2real.stages.load import available, defaults_of, load_robot
 
@@ -35,6 +36,49 @@ class StageFlags(Generic[Config]):
     """Folder of all runs."""
     run: Annotated[Path | None, Flag("DIR")] = None
     """Run folder to add to; default: a new one for record, for the others the newest one with their inputs."""
+
+
+@dataclass(frozen=True)
+class DemoFlags:
+    """Record, identify, train and deploy an emulated robot, with its defaults."""
+
+    seed: int | None = None
+    """Seed of every stage."""
+    runs: Path = Path("runs")
+    """Folder of all runs."""
+    resume: Annotated[Path | None, Flag("DIR")] = None
+    """Run folder to go on with: stages that are finished there, from the newest inputs, are skipped."""
+    verbose: bool = False
+    """Print everything that the stages print; default: a few lines for each stage."""
+
+
+@dataclass(frozen=True)
+class RunFlags(DemoFlags):
+    """Record, identify, train and deploy, one after the other."""
+
+    iterations: int = 1
+    """Most iterations: the verdict on a deployment chooses the stages that run again, until it is 'fine'."""
+    record: RecordConfig = field(default_factory=RecordConfig)
+    identify: IdentifyConfig = field(default_factory=IdentifyConfig)
+    train: TrainConfig = field(default_factory=TrainConfig)
+    deploy: DeployConfig = field(default_factory=DeployConfig)
+
+    def __post_init__(self) -> None:
+        """Check what can be checked before anything moves."""
+        if self.train.hosts.several:
+            raise UsageError(
+                "only training is divided among processes: each of them would record and deploy",
+                hint="record and identify in one, then `sim2real train PIPELINE --hosts.found` in all",
+            )
+        if self.iterations < 1:
+            raise UsageError(f"a run iterates at least once, got {self.iterations}", hint="--iterations 5")
+
+    def with_seed(self, seed: int | None) -> RunFlags:
+        """Return the flags with one seed in every stage; None changes nothing."""
+        if seed is None:
+            return self
+        stages: dict[str, Any] = {s: getattr(self, s) for s in ("record", "identify", "train", "deploy")}
+        return replace(self, **{stage: replace(config, seed=seed) for stage, config in stages.items()})
 
 
 def stage(command: str, arguments: list[str]) -> None:

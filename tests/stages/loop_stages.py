@@ -9,7 +9,7 @@ from sim2real.artifacts.deployment import Changed, Deployment, Drift, EpisodeRow
 from sim2real.artifacts.identification import ROUND_TRIP, Estimate, Identification, Judgement
 from sim2real.artifacts.run import STAGES, TAKES, Source, attempts, newest, open_stage, portable, sha256
 from sim2real.commands.loop import run_all
-from sim2real.commands.run import RunFlags
+from sim2real.commands.stages import RunFlags
 from sim2real.errors import Sim2RealError
 from sim2real.stages.load import load_robot
 

@@ -20,7 +20,7 @@ from sim2real.artifacts.iterations import iterations
 from sim2real.artifacts.recording import LOG, Recording
 from sim2real.artifacts.run import STAGES, attempts, finished, open_stage
 from sim2real.commands import loop
-from sim2real.commands.run import RunFlags
+from sim2real.commands.stages import RunFlags
 from sim2real.robots.loop import DELAYS
 from sim2real.stages.deploy.verdict import judge
 from sim2real.stages.load import load_robot

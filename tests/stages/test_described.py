@@ -172,7 +172,7 @@ def test_a_model_with_files_of_its_own_stays_where_it_is(workplace):
         (["new", "rig", "--mjcf", "none.xml", "--log", "run.npz"], "none.xml"),
         (["new", "Rig", "--mjcf", "robot.xml"], "small letters"),
         (["new", "rig"], "--mjcf"),
-        (["validate"], "validate needs parameters"),
+        (["validate"], "validate needs RUN|PIPELINE|PARAMETERS"),
     ],
 )
 def test_wrong_commands_are_refused_before_anything_is_compiled(workplace, capsys, arguments, named):

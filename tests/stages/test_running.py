@@ -5,7 +5,7 @@ from loop_stages import Stages, verdict
 
 from sim2real.artifacts.iterations import iterations
 from sim2real.artifacts.run import STAGES
-from sim2real.commands.run import RunFlags
+from sim2real.commands.stages import RunFlags
 from sim2real.errors import DelayChanged, UsageError
 from sim2real.view.sections import iterations_sections
 

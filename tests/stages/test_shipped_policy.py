@@ -6,7 +6,7 @@ import jax
 import pytest
 
 from sim2real.commands.loop import run_all, why_shipped
-from sim2real.commands.run import RunFlags
+from sim2real.commands.stages import RunFlags
 from sim2real.errors import UsageError
 from sim2real.stages.load import defaults_of, load_robot
 
