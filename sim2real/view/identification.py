@@ -4,9 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-from matplotlib.axes import Axes
 
-from sim2real.artifacts.files import number as as_number
 from sim2real.artifacts.identification import (
     Estimate,
     Identification,
@@ -17,7 +15,6 @@ from sim2real.artifacts.identification import (
 from sim2real.artifacts.run import StageFolder
 from sim2real.artifacts.summary import ArtifactTable
 from sim2real.log.schema import unit_of
-from sim2real.view import style
 from sim2real.view.blocks import (
     MISSING,
     Banner,
@@ -36,7 +33,6 @@ from sim2real.view.blocks import (
     sentence,
 )
 from sim2real.view.panels import Line, Panel, compared, over_time, with_gaps, with_unit
-from sim2real.view.style import BLUE, INK, ORANGE, new_figure, styled, to_svg
 
 _TITLES: dict[str, tuple[Tone, str]] = {
     "accepted": ("good", "Accepted"),
@@ -55,8 +51,6 @@ _AROUND_S = 1.0
 _GOAL = "told"
 """Baseline whose predictions are the goals of joints."""
 _LABELS = {"no delay": "model fitted without delays", "identified": "identified model", "measured": "measured"}
-_MIN_SHARE = 1e-4
-"""Delays with a smaller share of the largest share are not drawn."""
 
 
 def identify_section(artifact: StageFolder) -> PageSection:
@@ -204,33 +198,9 @@ def tried_blocks(result: Identification) -> list[Block]:
 
 
 def link_blocks(links: Sequence[Link]) -> list[Block]:
-    """Return figure and table of links; empty without links."""
-    if not links:
-        return []
-    with styled():
-        figure = new_figure(0.4 + 1.9 * len(links), style.PHONE_IN)
-        for axes, link in zip(figure.subplots(len(links), 1, squeeze=False)[:, 0], links, strict=True):
-            _draw_link(axes, link)
-        svg = to_svg(figure, "identify-links", "How delays are distributed")
-    caption = (
-        "Delays of messages, estimated from the motion: the share of each delay; line: the mean, band: its 95 % "
-        "interval, dashed: the 95th percentile. The motion determines only the sum of delays that are the same for all "
-        "messages."
-    )
-    return [FigureBlock(svg, caption), TableBlock.of("Links", links_table(links))]
-
-
-def _draw_link(axes: Axes, link: Link) -> None:
-    large = np.flatnonzero(link.share >= _MIN_SHARE * link.share.max())
-    drawn = slice(max(large[0] - 1, 0), large[-1] + 2)
-    axes.fill_between(1e3 * link.delays[drawn], 100.0 * link.share[drawn], step="mid", color=BLUE, alpha=0.8, lw=0)
-    if link.mean.low95 is not None and link.mean.high95 is not None:
-        axes.axvspan(1e3 * link.mean.low95, 1e3 * link.mean.high95, color=ORANGE, alpha=0.35, lw=0)
-    axes.axvline(1e3 * as_number(link.mean.value), color=INK, lw=1.0)
-    axes.axvline(1e3 * as_number(link.p95.value), color=INK, lw=1.0, ls="--")
-    lost = "" if link.lost.value is None else f"; {100.0 * link.lost.value:.2g} % lost"
-    axes.set_title(f"{' + '.join(link.parts)}{lost}", fontsize="small")
-    axes.set(xlabel="delay [ms]", ylabel="% of messages", ylim=(0.0, None))
+    """Return the table of links; empty without links."""
+    caption = "Delays of messages, estimated from the motion, which determines the sum of constant delays alone"
+    return [TableBlock.of(caption, links_table(links))] if links else []
 
 
 # -- errors and predictions

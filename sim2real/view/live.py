@@ -1,11 +1,10 @@
-"""A live view: follows the growing files of one or more stages, and sends new rows to a Rerun recording.
+"""A live view: follows the growing logs of one or more stages, and sends new rows to a Rerun recording.
 
 Of a log it sends at most 50 rows a second, and of each group of steps the latest one.
 """
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable
 from contextlib import suppress
@@ -15,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from sim2real.artifacts.progress import PROGRESS
 from sim2real.graph.episode import TICKS_PER_S, Episode, Steps
 from sim2real.log.reader import LogTail
 from sim2real.view.rerun_content import Curve, Tab, episode_tab, with_goals
@@ -33,7 +31,7 @@ _PATIENCE_S = 0.5
 
 
 class Follower:
-    """Sends the files of stages to a viewer as they grow.
+    """Sends the logs of stages to a viewer as they grow.
 
     A viewer that takes no data gets none until it has taken the last rows, so the memory of this process stays small.
 
@@ -46,7 +44,7 @@ class Follower:
     def __init__(self, recording: Any, folders: Callable[[], list[Path]], scene: Scene | None) -> None:
         self._recording, self._folders, self._scene = recording, folders, scene
         self._once = _StaticOnce(recording)
-        self._sources: dict[Path, LogSource | ProgressSource] = {}
+        self._sources: dict[Path, LogSource] = {}
         self._tabs: dict[Path, Tab] = {}
         self._curves: dict[Path, set[str]] = {}
         self._styled: set[str] = set()
@@ -57,8 +55,8 @@ class Follower:
         """Send the rows that are new since the last call."""
         taken = self._flushed()
         for path in (p for folder in self._folders() for p in sorted(folder.iterdir())):
-            if path not in self._sources and (source := self._source(path)) is not None:
-                self._sources[path] = source
+            if path not in self._sources and path.suffix == ".mcap":
+                self._sources[path] = LogSource(path, f"{path.parent.name}/{path.stem}", self._offset_s)
         for path, source in self._sources.items():
             with suppress(OSError):
                 if (tab := source.read()) is not None:
@@ -69,13 +67,6 @@ class Follower:
     def close(self) -> int:
         """Wait for the viewer a last time; return the number of updates that it did not get."""
         return self._dropped + (not self._flushed())
-
-    def _source(self, path: Path) -> LogSource | ProgressSource | None:
-        """Return the source for a file; None for other files."""
-        folder = path.parent.name
-        if path.suffix == ".mcap":
-            return LogSource(path, f"{folder}/{path.stem}", self._offset_s)
-        return ProgressSource(path, f"{folder}/curves", self._offset_s) if path.name == PROGRESS else None
 
     def _send(self, path: Path, tab: Tab) -> None:
         # Arrange the viewer for a tab with new curves.
@@ -128,40 +119,6 @@ class _StaticOnce:
     def send_columns(self, *arguments: Any) -> None:
         """Send columns."""
         self._recording.send_columns(*arguments)
-
-
-class ProgressSource:
-    """The new points of a stage's curves, as a tab with a plot for each name.
-
-    Args:
-        path: The file, see ``artifacts.progress``.
-        entity: Prefix of its entities.
-        offset_s: Returns the place of a wall clock's time [ns] on the live view's timeline [s].
-    """
-
-    def __init__(self, path: Path, entity: str, offset_s: Callable[[int], float]) -> None:
-        self._path, self._entity, self._offset_s, self._read = path, entity, offset_s, 0
-
-    def read(self) -> Tab | None:
-        """Return a tab with the points since the last call; None if there are none."""
-        # Take whole lines; the last one may still be growing.
-        with open(self._path, "rb") as stream:
-            stream.seek(self._read)
-            data = stream.read()
-        data = data[: data.rfind(b"\n") + 1]
-        self._read += len(data)
-        points = [json.loads(line) for line in data.splitlines()]
-        if not points:
-            return None
-        plots: dict[str, list[Curve]] = {}
-        for name, first in points[0]["values"].items():
-            some = [p for p in points if name in p["values"]]
-            t_s = np.array([self._offset_s(p["epoch_ns"]) for p in some])
-            for seed in range(len(first)):
-                label = name if len(first) == 1 else f"seed {seed}"
-                values = np.array([p["values"][name][seed] for p in some], np.float64)
-                plots.setdefault(name, []).append(Curve(f"{self._entity}/{name}/{seed}", label, "", t_s, values))
-        return Tab(self._entity, self._entity, plots, [], recent_s=math.inf)
 
 
 class LogSource:

@@ -110,8 +110,7 @@ def test_a_log_that_is_moved_during_the_fit_keeps_its_hash(pendulum, tmp_path, m
 
 def test_a_thread_that_still_computes_ends_once_its_stage_has(tmp_path):
     stage = SimpleNamespace(folder=tmp_path, run_dir=tmp_path)
-    inputs = SimpleNamespace(config=SimpleNamespace(view=None))
-    with pytest.raises(ZeroDivisionError), kept(stage, inputs, "") as best:
+    with pytest.raises(ZeroDivisionError), kept(stage, None, "") as best:
         raise ZeroDivisionError
     with pytest.raises(RuntimeError):
         best.advance("search", 0.1, 1.0, np.zeros(1))

@@ -1,4 +1,4 @@
-"""What was found of links, on a page: a distribution, and numbers in the units that people read."""
+"""What was found of links, on a page: numbers in the units that people read."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def link():
 
 
 def test_numbers_stand_with_their_intervals_and_what_is_not_known_is_left_out(link):
-    _, table = link_blocks([link])
+    (table,) = link_blocks([link])
     assert [row[0] for row in table.rows] == [
         "sensor_delay + actuator_delay, mean", "sensor_delay + actuator_delay, 95 % of the messages",
         "sensor_delay, deviation", "sensor_delay, lost",

@@ -2,17 +2,17 @@
 
 import io
 import json
-import math
+import time
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from sim2real.artifacts.progress import PROGRESS, write_progress
 from sim2real.errors import Sim2RealError
-from sim2real.graph.episode import Episode, Steps
+from sim2real.graph.episode import Episode, StepRecord, Steps
+from sim2real.log import McapRecorder
 from sim2real.stages import live
-from sim2real.view.live import Follower, LogSource, ProgressSource, _thinned
+from sim2real.view.live import Follower, LogSource, _thinned
 from sim2real.view.model_scene import ModelScene
 
 rr = pytest.importorskip("rerun")
@@ -62,41 +62,27 @@ def test_a_goal_stands_beside_the_position_of_its_joint(tmp_path, monkeypatch):
     assert list(beside.values()) == [[0.0, 1.0], [0.0, 1.0]]
 
 
-def test_curves_grow_by_whole_lines(tmp_path):
-    source = ProgressSource(tmp_path / PROGRESS, "train/curves", lambda ns: ns / 1e9)
-    write_progress(tmp_path, {"return": np.array([1.0, 2.0]), "loss": 0.5})
-    first = source.read()
-    assert {title: [c.values.tolist() for c in plot] for title, plot in first.plots.items()} == {
-        "return": [[1.0], [2.0]],
-        "loss": [[0.5]],
-    }
-    assert source.read() is None
-    with open(tmp_path / PROGRESS, "a") as stream:
-        stream.write('{"epoch_ns": 1, "values": {"re')
-    assert source.read() is None
-    with open(tmp_path / PROGRESS, "a") as stream:
-        stream.write('turn": [3.0, NaN]}}\n')
-    second = source.read()
-    assert second.plots["return"][0].values.tolist() == [3.0]
-    assert math.isnan(second.plots["return"][1].values[0])
-
-
 def test_a_follower_sends_each_row_once_and_what_stands_still_once(tmp_path):
-    stage = tmp_path / "train"
+    stage = tmp_path / "record"
     stage.mkdir()
     recording = rr.RecordingStream("test")
     recording.save(tmp_path / "live.rrd")
     follower = Follower(recording, lambda: [stage], None)
     follower.poll()
-    for i in range(5):
-        write_progress(stage, {"return": float(i)})
+    log = McapRecorder(stage / "log.mcap", {}, {}, {"sensor": {"th": 0.0}}, [])
+    log.start(time.time_ns(), time.monotonic_ns())
+    for k in range(5):
+        at = 20_000 * k
+        log.step(StepRecord("sensor", k, at, at, at, -1, at + 1000, 0), {"th": 0.1 * k})
         follower.poll()
-        follower.poll()
+    log.close()
+    follower.poll()
+    follower.poll()
     assert follower.close() == 0
     recording.disconnect()
     moving, static = rows_of(tmp_path / "live.rrd")
-    assert moving["/train/curves/return/0"] == 5
-    assert static["/train/curves/return/0"] == 1
+    assert moving["/record/log/sensor/th"] == 5
+    assert static["/record/log/sensor/th"] == 1
 
 
 MODEL = """

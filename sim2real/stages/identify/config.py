@@ -5,7 +5,7 @@ from typing import Annotated
 
 from sim2real.errors import UsageError
 from sim2real.identification.config import FitConfig
-from sim2real.stages.flag import Flag, ViewFlag, check_view
+from sim2real.stages.flag import Flag
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,6 @@ class IdentifyConfig(FitConfig):
     folds: int = 5
     """Parts that are held out of a refit, one at a time, to measure errors on new data: each of several logs, or this
     many blocks of a single log; 0 skips the refits."""
-    view: ViewFlag = None
-    """Show the loss in the Rerun viewer while the search runs; 'web': for browsers."""
     terms: str = "own"
     """Optional terms: 'own' (the pipeline's, and one that halves the errors on held-out parts), 'auto' (chosen on
     held-out parts), 'all', 'none', or names separated by commas."""
@@ -53,7 +51,6 @@ class IdentifyConfig(FitConfig):
     def __post_init__(self) -> None:
         """Check the values before a log is read."""
         super().__post_init__()
-        check_view(self.view)
         if not 0.0 <= self.held_out <= 0.8:
             raise UsageError(f"held_out must lie in [0, 0.8], got {self.held_out}")
         if self.held_out == 0.0 and not self.hold_out:

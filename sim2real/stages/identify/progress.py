@@ -1,7 +1,7 @@
-"""The course of a fit: its best values so far, and the files that show and keep them.
+"""The course of a fit: its best values so far, and the file that keeps them.
 
-``progress.jsonl`` is for a viewer that joins the search. ``partial.json`` has the fitted values
-while they are judged; it stays if a signal or an error ends the stage before the verdict.
+``partial.json`` has the fitted values while they are judged; it stays if a signal or an error ends the stage before the
+verdict.
 """
 
 from __future__ import annotations
@@ -15,13 +15,11 @@ import numpy as np
 
 from sim2real.artifacts.identification import Identification, Judgement
 from sim2real.artifacts.paths import shown
-from sim2real.artifacts.progress import write_progress
 from sim2real.artifacts.run import OpenStage
 from sim2real.identification.fit import as_numbers
 from sim2real.identification.parameters import ParameterTable
 from sim2real.identification.verdict import estimates
 from sim2real.stages.identify.inputs import Inputs
-from sim2real.stages.live import live_view
 from sim2real.stages.terminal.console import note
 
 PARTIAL = "partial.json"
@@ -73,9 +71,6 @@ class Best:
         if loss < self.loss or (stage == "refine" and not self.done["refine"]):
             self.z, self.loss = np.array(z), loss
         self.done[stage] = min(1.0, self.done[stage] + share)
-        if self.folder is None or self.inputs is None or self.z is None or not np.isfinite(self.loss):
-            return
-        write_progress(self.folder, {"loss": self.loss})
 
     def fitted(self, z: np.ndarray, loss: float) -> None:
         """Record the finished fit, which is written before the longer judgement begins.
@@ -102,7 +97,7 @@ class Best:
 
 @contextmanager
 def kept(stage: OpenStage, inputs: Inputs, again: str) -> Iterator[Best]:
-    """Yield the record of the best values, with its files in the stage's folder, beside a viewer if one is configured.
+    """Yield the record of the best values, with its file in the stage's folder.
 
     ``partial.json`` is an output of the stage if a signal ends it, or an error after the fit. A judgement removes it.
 
@@ -111,8 +106,7 @@ def kept(stage: OpenStage, inputs: Inputs, again: str) -> Iterator[Best]:
     """
     best, path = Best(stage.folder, inputs, again), stage.folder / PARTIAL
     try:
-        with live_view(inputs.config.view, stage.folder, f"identify {stage.run_dir.name}", dict):
-            yield best
+        yield best
     except BaseException as error:
         best.ended = True
         signalled = isinstance(error, KeyboardInterrupt | SystemExit)

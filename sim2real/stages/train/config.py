@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from sim2real.errors import UsageError
-from sim2real.stages.flag import Flag, ViewFlag, check_seed, check_view
+from sim2real.stages.flag import Flag, check_seed
 from sim2real.training.config import PPOConfig
 from sim2real.training.environment.variation import VariationConfig
 from sim2real.training.scale.hosts import HostsConfig
@@ -22,16 +22,13 @@ class LearningConfig:
     every seed, the best policy of all is saved."""
     checkpoint: bool = True
     """Write the whole training into a file after each evaluation, to continue from with --resume."""
-    view: ViewFlag = None
-    """Show the curves in the Rerun viewer while the training runs; 'web': on a page for browsers."""
     hosts: HostsConfig = field(default_factory=HostsConfig)
     """Several processes, on this host or others, that make one training."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
     """The learning algorithm."""
 
     def __post_init__(self) -> None:
-        """Check the viewer and the sweep."""
-        check_view(self.view)
+        """Check the sweep."""
         Sweep.parse(self.sweep).configs(self.ppo)
 
 

@@ -13,12 +13,10 @@ import jax
 from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.paths import shown
-from sim2real.artifacts.progress import write_progress
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run import RUNNING, StageFolder, attempts, newest, open_stage, run_folders, sha256
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.robots.robot import RecordedRobot
-from sim2real.stages.live import live_view
 from sim2real.stages.load import AnyRobot, defaults_of, moving, robot_of
 from sim2real.stages.shared import arguments
 from sim2real.stages.shared.arguments import (
@@ -167,11 +165,9 @@ def run(robot: RecordedRobot, config: TrainConfig, root: Path, run_dir: Path | N
 
     # Train, write the bundle with the hashes of the files that it came from, and print.
     with open_stage(root, robot.name, "train", config, files, run_dir) as stage:
-        view = live_view(config.view, stage.folder, f"train {stage.run_dir.name}", dict)
-        with resumable(stage.folder) as checkpoint, view:
+        with resumable(stage.folder) as checkpoint:
             file, log = checkpoint if config.checkpoint else None, _recording(identification, stage.run_dir)
-            watch: Watch = lambda p: write_progress(stage.folder, p.values)  # noqa: E731
-            bundle = train(robot, identification, config, None, file, resume, watch, log)
+            bundle = train(robot, identification, config, checkpoint=file, resume=resume, log=log)
         hashes = {name: sha256(file) for name, file in files.items()}
         if identification is not None and identification.logs:
             hashes["log"] = identification.logs[0].sha256
