@@ -6,9 +6,11 @@ built documentation.
 
 from __future__ import annotations
 
+import functools
 import importlib
 import json
 import sys
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -19,31 +21,26 @@ sys.path.insert(0, str(Path(__file__).parent))
 from benches.rows import ROOT, Report, markdown, missed
 
 TABLES = {
-    "evidence": ("recorded.league.evidence", "randomise", "league"),
-    "demo": ("runs.demo.table", "demo"),
-    "demo_time": ("runs.demo.sentence", "demo"),
-    "arm": ("runs.arm.table", "arm_cpu"),
-    "so101": ("runs.arm.table", "so101_cpu"),
-    "so101_time": ("runs.arm.sentence", "so101_cpu"),
+    "why": ("recorded.league.why", "league", "pays"),
+    "evidence": ("recorded.league.evidence", "league"),
+    "whole_runs": ("runs.stages.table", "demo", "arm_cpu", "so101_cpu"),
     "league": ("recorded.league.table", "league"),
-    "worst_joint": ("recorded.league.worst_joint", "league"),
     "latency": ("latency.table", "latency_league"),
-    "randomise": ("hidden.randomise.table", "randomise", "randomise_worn"),
     "pays": ("pays.table", "pays"),
+    "randomise": ("hidden.randomise.table", "randomise", "randomise_worn"),
     "doctor": ("doctor.table", "doctor"),
-    "compiled": ("graph.table", "graph_h200"),
-    "on_a_gpu": ("train.table", "train_h200"),
-    "warp": ("compose.table", "compose_warp_h200"),
-    "drift": ("drift.table", "drift_so101"),
-    "devices": ("train.scaling", "scaling_h200"),
     "walk": ("walk.table", "walk"),
-    "legs_identify": ("legs_identify.table", "legs_identify"),
     "walk_delays": ("walking.delays.table", "walk_delays"),
     "walk_train": ("walking.train.table", "walk_train"),
+    "legs_identify": ("legs_identify.table", "legs_identify"),
+    "compiled": ("graph.table", "graph_h200"),
+    "warp": ("compose.table", "compose_warp_h200"),
+    "on_a_gpu": ("train.table", "train_h200"),
+    "devices": ("train.scaling", "scaling_h200"),
+    "drift": ("drift.table", "drift_so101"),
 }
 """Name between the markers -> function of a bench, and the reports that it gets."""
 IMAGES = {
-    "docs/images/what_training_knows.svg": ("hidden.randomise.figure", "randomise", "randomise_worn"),
     "docs/images/identification_pays.svg": ("pays.figure", "pays"),
     "docs/images/falls_over_delay.svg": ("walking.delays.figure", "walk_delays"),
 }
@@ -58,9 +55,18 @@ def made(function: str, *reports: Report) -> Any:
 def origin(name: str, report: Report) -> str:
     """Return commit, date and machine of a report, and its note if it has one."""
     machine = report["machine"]
-    devices = [d for d in machine.get("devices", ()) if d != "cpu"] or [f"{machine['cores']} cores, {machine['cpu']}"]
+    cpu = f"{machine['cores']} cores, {machine['cpu'].replace('(R)', '')}"
+    devices = [d for d in machine.get("devices", ()) if d != "cpu"] or [cpu]
     note = f" ({report['note']})" if "note" in report else ""
     return f"{name}: `{report['commit'][:7]}`, {report['date']}, {devices[0]}{note}"
+
+
+def with_origin(text: str, origins: str) -> str:
+    """Return a text of tables and paragraphs with its origin behind it, paragraphs in lines of a page."""
+    *parts, last = text.strip("\n").split("\n\n")
+    parts += [last, origins] if last.startswith("|") else [f"{last} {origins}".strip()]
+    wrap = functools.partial(textwrap.fill, width=118, break_long_words=False, break_on_hyphens=False)
+    return "\n\n".join(part if part.startswith("|") else wrap(part) for part in parts) + "\n"
 
 
 def missed_goals(reports: dict[str, Report]) -> str:
@@ -83,7 +89,8 @@ def main() -> int:
     tables = {"missed": missed_goals(reports)}
     for table, (function, *names) in TABLES.items():
         about = "; ".join(origin(name, reports[name]) for name in names)
-        tables[table] = f"{made(function, *(reports[name] for name in names))}\nMeasured: {about}.\n"
+        text = made(function, *(reports[name] for name in names))
+        tables[table] = with_origin(text, f"Measured: {about}." if table != "why" else "")
     for page in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))):
         text = old = page.read_text()
         for name, table in tables.items():

@@ -14,7 +14,7 @@ import numpy as np
 from flax import struct
 from mujoco import mjx
 
-from benches.rows import Report, Row, markdown, medians, row, values
+from benches.rows import Report, Row, medians, row, values
 from sim2real import composer
 from sim2real.composer import mjcf
 from sim2real.composer.observation.observable import MJCFFeature
@@ -192,22 +192,20 @@ def compared(copies: int, repeats: int, length: int) -> list[Row]:
 def table(report: Report) -> str:
     """Return the times of tasks on MuJoCo Warp over those of bare steps."""
     v = values(report, "compose/gpu/warp/")
-    copies = dict.fromkeys(int(name.partition("/")[0]) for name in v)
-    head = (
-        *("copies", "physics steps per second, `mjx.step` alone", "time of the task with late observables"),
-        "time of the task in a graph with delays",
-    )
-    lines = [
-        (
-            *(f"{n:,}", f"{v[f'{n}/bare_steps_per_s'] / 1e6:.1f} million"),
-            *(f"{v[f'{n}/env_over_bare']:.3f} times as long", f"{v[f'{n}/graph_over_bare']:.3f} times"),
-        )
-        for n in copies
-    ]
+    copies = list(dict.fromkeys(int(name.partition("/")[0]) for name in v))
+
+    def span(name: str) -> str:
+        each = [v[f"{n}/{name}"] for n in copies]
+        return f"{min(each):.3f} to {max(each):.3f}"
+
     compiled = [v[f"{n}/{kind}_compile_s"] for n in copies for kind in ("env", "graph")]
-    return markdown(head, lines, "rrrr") + (
-        f"\nA program takes {min(compiled):.0f} to {max(compiled):.0f} s to compile; building Warp's kernels takes "
-        f"{max(v[f'{n}/first_reset_s'] for n in copies):.0f} s more, once for a machine.\n"
+    kernels_s = max(v[f"{n}/first_reset_s"] for n in copies)
+    return (
+        f"With {copies[0]:,} to {copies[-1]:,} copies a task with late observables takes {span('env_over_bare')} times "
+        f"as long as its physics alone, and in a graph with delays {span('graph_over_bare')} times. `mjx.step` alone "
+        f"makes {v[f'{copies[-1]}/bare_steps_per_s'] / 1e6:.1f} million steps a second at the most copies. A program "
+        f"takes {min(compiled):.0f} to {max(compiled):.0f} s to compile; Warp's kernels take {kernels_s:.0f} s "
+        "more, once for a machine.\n"
     )
 
 

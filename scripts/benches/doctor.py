@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from benches.robots_that_fail import FAULTS, KINDS, Robot, deploy, draw, draw_faults, kinds_for, write_case
-from benches.rows import Report, Row, markdown, missed, row
+from benches.rows import Report, Row, row
 from sim2real.doctor.contract import Policy, read_policy
 from sim2real.doctor.diagnosis import diagnose
 from sim2real.doctor.log import read_deployment
@@ -155,9 +155,20 @@ def _one_thing(pair: tuple[str, ...]) -> bool:
 
 
 def table(report: Report) -> str:
-    """Return a line for each fault."""
-    lines = []
-    for r in report["rows"]:
-        named = f"{r['value']} {r['unit']}" + f" (goal {r['goal']}, missed)" * missed(r)
-        lines.append((r["name"].removeprefix("doctor/"), named, r["yardstick"]))
-    return markdown(("fault", "named", ""), lines, "lrl")
+    """Return how many faults were named, those that were missed, false alarms and pairs."""
+    of = {r["name"].removeprefix("doctor/"): r for r in report["rows"]}
+    faults = {name: of[name] for name in report["flags"]["faults"]}
+    named, judged = (
+        sum(int(n) for n in counts)
+        for counts in zip(*((r["value"], r["unit"].split()[1]) for r in faults.values()), strict=True)
+    )
+    extra = [n for n, r in faults.items() if not r["yardstick"].startswith("0 ")]
+    less = [f"{n} {r['value']} {r['unit']}" for n, r in faults.items() if r["value"] < int(r["unit"].split()[1])]
+    alarms, pairs = (f"{of[name]['value']} {of[name]['unit']}" for name in ("false alarms", "two faults"))
+    robots = f"{report['flags']['robots']} robots for each of {len(faults)}"
+    return (
+        f"Named: {named} of {judged} faults, {robots} ({', '.join(faults)})"
+        + (f", fewer of {', '.join(less)}" if less else "")
+        + (f"; a second name beside the right one for {', '.join(extra)}" if extra else "")
+        + f". False alarms: {alarms} sound robots. Both of two faults: {pairs}. Longest: {of['longest']['value']} s.\n"
+    )

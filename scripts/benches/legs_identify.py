@@ -13,7 +13,7 @@ import numpy as np
 
 from benches.hidden import legs
 from benches.jobs import each
-from benches.rows import Report, Row, four_digits, markdown, row, share, values
+from benches.rows import Report, Row, four_digits, row, share, values
 
 QUICK = {"twins": 1, "seconds": 12.0, "settings": "quick"}
 SETTINGS: dict[str, dict[str, Any]] = {
@@ -105,25 +105,20 @@ def _share(name: str, count: int, of: int, about: str, goal: str = ">= 1") -> Ro
 
 
 def table(report: Report) -> str:
-    """Return the errors of identified Go2s, a line for each kind of parameter."""
+    """Return the errors of identified Go2s."""
     v = values(report, "legs_identify/")
     about = {r["name"].removeprefix("legs_identify/"): r["yardstick"] for r in report["rows"]}
-    labels = {kind: (f"{kind} of a group", "%") for kind in KINDS} | {
-        "strength": ("strength of a motor", "%"),
-        "delay": ("sum of the delays, within 1 ms", "ms"),
-        "load": (f"load in the base, within {CLOSE_KG} kg", "kg"),
-    }
 
     def counted(name: str) -> str:
         return " ".join(about[name].split(" ")[:3])
 
-    lines = [(text, counted(f"{kind}/close"), f"{v[f'{kind}/worst']:.2g} {u}") for kind, (text, u) in labels.items()]
+    worst = ", ".join(f"{kind} {v[f'{kind}/worst']:.2g} %" for kind in KINDS)
     interval = about["all_close"].rpartition("; ")[2].replace("95 % interval ", "")
     slow = " (goal 90, missed)" * (v["cpu_s"] > 90)
-    cores, too_few = report["machine"]["cores"], ", fewer than 95 %: the goal is missed" * (v["intervals"] < 0.95)
-    return markdown(("", "within 10 %", "worst"), lines) + (
-        f"\n{counted('accepted')} identifications are accepted; in {counted('all_close')} all parameters are within "
-        f"10 % (95 % interval of that share: {interval}).\nThe 95 % intervals hold the truth in "
-        f"{counted('intervals')} cases{too_few}. On {cores} cores an identification takes\n"
-        f"{v['wall_s']:.0f} s at most, {v['cpu_s']:.0f} s of a processor{slow}.\n"
+    cores, too_few = report["machine"]["cores"], " (goal 95 %, missed)" * (v["intervals"] < 0.95)
+    return (
+        f"{counted('accepted')} identifications are accepted, and in {counted('all_close')} all parameters are within "
+        f"10 % (95 % interval: {interval}). Worst errors: {worst}, delay {v['delay/worst']:.2g} ms, load in the base "
+        f"{v['load/worst']:.2g} kg. The 95 % intervals hold the truth in {counted('intervals')} cases{too_few}. On "
+        f"{cores} cores an identification takes {v['wall_s']:.0f} s at most, {v['cpu_s']:.0f} s of a processor{slow}.\n"
     )

@@ -122,4 +122,4 @@ def table(report: Report) -> str:
         cells = [f"{r['value']:.3f} {r['unit']}" + f" (goal {r['goal']}, missed)" * missed(r) for r in errors]
         count = f"{falls['value']} {falls['unit']}" + f" (goal {falls['goal']}, missed)" * missed(falls)
         lines.append((falls["yardstick"] + delay, count, *cells))
-    return markdown(("twins", "falls", "error", "error"), lines)
+    return markdown(("twins", "falls", "velocity error", "yaw rate error"), lines)

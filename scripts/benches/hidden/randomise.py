@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from benches.hidden import robots as hidden
 from benches.jobs import robots
@@ -202,21 +201,3 @@ def table(ideal: Report, worn: Report) -> str:
     count, trials = (ideal["flags"][name] for name in ("robots", "trials"))
     head = f"trained on, {count} hidden robots with {trials} deployments each"
     return markdown([head, "nearly ideal", "95 %", "worn", "95 %"], lines)
-
-
-def figure(ideal: Report, worn: Report) -> Figure:
-    """Return README's figure: success on hidden robots by what the training was given."""
-    drawn = Figure((8.2, 2.9), layout="constrained")
-    axes = drawn.subplots()
-    places = np.arange(len(TRAINED_ON))
-    for offset, (report, label) in zip(
-        (-0.18, 0.18), ((ideal, "nearly ideal robots"), (worn, "worn robots")), strict=True
-    ):
-        shares = [100 * values(report)[f"randomise/{way}/success"] for way in TRAINED_ON]
-        axes.bar_label(axes.barh(places + offset, shares, 0.34, label=label), fmt="%.0f %%", padding=3)
-    axes.set_yticks(places, list(TRAINED_ON.values()))
-    axes.set(xlim=(0, 110), xticks=[], xlabel="deployments that swing up and balance")
-    axes.invert_yaxis()
-    axes.spines[["top", "right", "bottom"]].set_visible(False)
-    drawn.legend(loc="outside upper center", ncols=2)
-    return drawn

@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from benches.rows import Report, Row, markdown, row
+from benches.rows import Report, Row, row
 from benches.runs import demo, stages
 
-CLOSE_M = 0.02
 SETTLE_S = 0.3
 """Time of a prediction before it is compared [s]."""
 QUICK = demo.QUICK
@@ -59,7 +58,7 @@ def rows(arm: str, seeds: list[Row]) -> list[Row]:
     lines.append(row(f"{arm}/held_out_mae_mrad", mae, "mrad", "1 s ahead, held out", "< 10"))
     for key, label in (("distances_m", "identified"), ("nominal_distances_m", "nominal")):
         if key in seeds[0]:
-            reached = [int(np.sum(np.array(s[key]) < CLOSE_M)) for s in seeds]
+            reached = [int(np.sum(np.array(s[key]) < stages.CLOSE_M)) for s in seeds]
             goal = ">= 9" if label == "identified" else ""
             lines.append(
                 row(f"{arm}/reached/{label}", reached, f"of {len(seeds[0][key])}", "within 2 cm at the end", goal)
@@ -67,33 +66,3 @@ def rows(arm: str, seeds: list[Row]) -> list[Row]:
             middle = [round(1e3 * float(np.median(s[key])), 1) for s in seeds]
             lines.append(row(f"{arm}/distance/{label}", middle, "mm", "median"))
     return lines
-
-
-def table(report: Report) -> str:
-    """Return the results of the first seed."""
-    of = {
-        "arm": "the arm: three position-controlled servos on one bus",
-        "so101": "the SO-101: six servos with the parameters of a real one",
-    }
-    run, goal = report["runs"][0], 9
-
-    def reached(distances: list[float]) -> str:
-        good = sum(d < CLOSE_M for d in distances)
-        return f"{good} of {len(distances)} deployments, median {1e3 * np.median(distances):.1f} mm off"
-
-    missed = f"; the goal of {goal} is missed" if sum(d < CLOSE_M for d in run["distances_m"]) < goal else ""
-    truth = run["round_trip_ms"] - run["round_trip_error_ms"]
-    lines = [
-        ("held-out motion, 1 s ahead", f"{run['mae_mrad']:.1f} mrad mean absolute error"),
-        *stages.about_held_out([run]),
-        ("round-trip delay", f"{abs(run['round_trip_error_ms']):.1f} ms off the true {truth:.0f} ms"),
-        ("within 2 cm of the target", reached(run["distances_m"]) + missed),
-        ("the same without identification", reached(run["nominal_distances_m"])),
-        ("time", f"{run['total_s']:.0f} s on two CPU cores ({stages.times([run])} s)"),
-    ]
-    return markdown(["", of[report["bench"]]], lines, "ll")
-
-
-def sentence(report: Report) -> str:
-    """Return the time of a run."""
-    return stages.sentence(report, "the run")

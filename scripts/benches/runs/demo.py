@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from benches.rows import Report, Row, markdown, row
+from benches.rows import Report, Row, row
 from benches.runs import stages
 
 from sim2real.artifacts.recording import Recording
@@ -142,37 +142,3 @@ def _simulate(
         plant.advance(max(float(sample), 0.0))
         angles.append(float(plant.data.qpos[0]))
     return np.array(angles)
-
-
-def table(report: Report) -> str:
-    """Return the results of all seeds: the worst of the errors, the sums of deployments."""
-    runs = report["runs"]
-    worst = {n: max(abs(r["errors"][n]) for r in runs) for n in runs[0]["errors"]}
-    name = max(worst, key=lambda n: worst[n])
-    ours, nominal = ([d for r in runs for d in r[key]] for key in ("deployments", "nominal_deployments"))
-    truth = np.mean([r["round_trip_ms"] - r["round_trip_error_ms"] for r in runs])
-    off = max(abs(r["round_trip_error_ms"]) for r in runs)
-    lines = [
-        ("parameters", f"at most {100 * worst[name]:.1f} % off the true ones ({name})"),
-        ("round-trip delay", f"at most {off:.1f} ms off the true {truth:.0f} ms"),
-        (
-            "prediction, 1 s ahead",
-            f"{max(r['prediction_over_true_model'] for r in runs):.2f} times the error of the true model at most",
-        ),
-        *stages.about_held_out(runs),
-        (
-            "upright on the robot",
-            f"in {sum(d >= 0.9 for d in ours)} of {len(ours)} deployments at least 90 % of the last 5 s",
-        ),
-        (
-            "the same without identification",
-            f"{sum(d >= 0.9 for d in nominal)} of {len(nominal)}: nominal parameters, no delays, the same training",
-        ),
-        ("time", f"{max(r['total_s'] for r in runs):.0f} s at most on two CPU cores ({stages.times(runs)} s)"),
-    ]
-    return markdown(["", f"{len(runs)} runs of the demo, each on a robot with noise of its own"], lines, "ll")
-
-
-def sentence(report: Report) -> str:
-    """Return the time of a run."""
-    return stages.sentence(report, "the demo")

@@ -10,11 +10,11 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from benches.rows import Report, Row, row
+from benches.rows import Report, Row, markdown, row
 
 from sim2real.artifacts.files import plain
 from sim2real.artifacts.identification import Identification
@@ -110,24 +110,41 @@ def rows(name: str, seeds: list[Row], goals: dict[str, str]) -> list[Row]:
     return lines
 
 
-def about_held_out(runs: Sequence[dict[str, Any]]) -> list[tuple[str, str]]:
-    """Return the table's line on errors on held-out data beside the errors that were expected before."""
-    lines = [line for run in runs for line in run["compared"]]
-    below, worst = sum(line["ratio"] <= 1.0 for line in lines), max(line["ratio"] for line in lines)
-    text = f"{below} of {len(lines)} below the expected error; the worst is {worst:.2f} times as large"
-    return [("errors on held-out data", text)]
+CLOSE_M, LEAST_UPRIGHT = 0.02, 0.9
+"""Success of a deployment: distance of an arm from its target [m]; share of the last 5 s in which a pendulum is up."""
 
 
-def times(runs: Sequence[dict[str, Any]]) -> str:
-    """Return the median time of each stage [s] as text."""
-    return ", ".join(f"{stage} {statistics.median(run[f'{stage}_s'] for run in runs):.0f}" for stage in STAGES)
-
-
-def sentence(report: Report, subject: str) -> str:
-    """Return the sentence on the time of a run: the median over its seeds, and that of each stage."""
-    total, *each = (statistics.median(r[f"{name}_s"] for r in report["runs"]) for name in ("total", *STAGES))
-    record, identify, train, deploy = (f"{stage:.0f} s" for stage in each)
-    return (
-        f"On two CPU cores {subject} takes {total:.0f} s: {record} to record, {identify} to\n"
-        f"identify, {train} to train and {deploy} to deploy.\n"
-    )
+def table(*reports: Report) -> str:
+    """Return the results of the pendulum, the arm and the SO-101: the worst of the errors, the sums of deployments."""
+    rows = [
+        "whole runs, each on a robot with noise of its own",
+        "prediction of a held-out second",
+        "round-trip delay, error",
+        "held-out errors within the expected ones",
+        "successful deployments",
+        "the same training on nominal parameters without delays",
+    ]
+    columns = []
+    for report in reports:
+        runs = report["runs"]
+        ratios = [line["ratio"] for run in runs for line in run["compared"]]
+        if report["bench"] == "demo":
+            name, unit = "pendulum: at least 90 % of the last 5 s upright", "share"
+            error = f"{max(run['prediction_over_true_model'] for run in runs):.2f} times the true model's at most"
+            kinds = ("deployments", "nominal_deployments")
+        else:
+            name = {"arm": "arm of three servos", "so101": "SO-101"}[report["bench"]] + ": within 2 cm of the target"
+            error, unit = f"{max(run['mae_mrad'] for run in runs):.1f} mrad mean absolute error", "m"
+            kinds = ("distances_m", "nominal_distances_m")
+        counts = []
+        for kind in kinds:
+            scores = [score for run in runs for score in run[kind]]
+            good = [score < CLOSE_M if unit == "m" else score >= LEAST_UPRIGHT for score in scores]
+            middle = f", median {1e3 * statistics.median(scores):.1f} mm off" if unit == "m" else ""
+            counts.append(f"{sum(good)} of {len(good)}{middle}")
+        off = max(abs(run["round_trip_error_ms"]) for run in runs)
+        truth = statistics.mean(run["round_trip_ms"] - run["round_trip_error_ms"] for run in runs)
+        within = f"{sum(ratio <= 1.0 for ratio in ratios)} of {len(ratios)}, the worst {max(ratios):.2f} times as large"
+        columns.append((name, str(len(runs)), error, f"{off:.1f} ms of {truth:.0f} ms", within, *counts))
+    head, *lines = zip(("", *rows), *columns, strict=True)
+    return markdown(head, lines, "l" * len(head))

@@ -22,7 +22,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from benches.jobs import each
-from benches.rows import Report, markdown, share
+from benches.rows import Report, share
 from benches.walk import Trial, judged
 from benches.walking.train import PIPELINE, add_training_flags, require_gpu, train
 
@@ -140,20 +140,27 @@ LABELS = {
 }
 
 
+MOST_FALLS = 1
+"""Falls up to which a policy is not named."""
+
+
 def table(report: Mapping[str, Any]) -> str:
-    """Return the table: a row for each delay, falls and errors of each policy; falls alone of the other identified."""
+    """Return the falls of policies that were trained for another delay than the true one."""
     delays, v = _of(report)
-    twins, every = report["flags"]["twins"], ", ".join(f"{ms:g}" for ms in delays)
-    lines = []
-    for ms in delays:
-        cells = [
-            f"{v[name, ms, _FALLS]} of {twins}; {v[name, ms, _ERROR]:.3f} m/s, {v[name, ms, 'error_rad_s']:.3f} rad/s"
-            for name in LABELS
-        ]
-        others = ", ".join(str(v[f"{IDENTIFIED}{trained:g}", ms, _FALLS]) for trained in delays)
-        lines.append((f"{ms:g} ms", *cells, others))
-    head = ("true delay", *LABELS.values(), f"falls of those identified at {every} ms")
-    return markdown(head, lines, "r" * len(head))
+    twins = report["flags"]["twins"]
+    falls = [
+        f"{v[f'{IDENTIFIED}{trained:g}', ms, _FALLS]} of {twins} (trained at {trained:g} ms, true {ms:g} ms)"
+        for trained in delays
+        for ms in delays
+        if v[f"{IDENTIFIED}{trained:g}", ms, _FALLS] > MOST_FALLS
+    ]
+    over = [v["wide", ms, _ERROR] / v["identified", ms, _ERROR] - 1 for ms in delays]
+    fallen = sum(v["wide", ms, _FALLS] for ms in delays)
+    return (
+        f"`wide` falls on {fallen} twins; its velocity error is {100 * min(over):+.0f} to {100 * max(over):+.0f} % "
+        "beside that of the policy with the true delay. At other delays than their own, identified policies fall: "
+        f"{', '.join(falls)}.\n"
+    )
 
 
 def figure(report: Mapping[str, Any]) -> Figure:

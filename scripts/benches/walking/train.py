@@ -19,7 +19,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from benches.rows import Report, Row, markdown, missed, row
+from benches.rows import Report, Row, missed, row
 from benches.walk import Trial, judged
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.runtime.compilation_cache import OFF, VARIABLE
@@ -86,26 +86,21 @@ def trained(options: argparse.Namespace, steps: int, scratch: Path) -> tuple[lis
     return rows + judge, not any(missed(r) for r in judge if r["name"].startswith(f"{name}/calm/"))
 
 
-LABELS = {
-    "learnt_steps_per_s": "learnt steps a second",
-    "command_s": "from the command to the policy's bundle",
-    "compile_s": "of it: trace and compile",
-    "calm/falls": "falls of its twins",
-    "calm/error_m_s": "error of the velocity",
-    "calm/error_rad_s": "error of the yaw rate",
-    "pushed/falls": "falls with pushes",
-    "kernels_s": "once on a machine: Warp's kernels",
-}
-
-
 def table(report: Report) -> str:
     """Return the figures of a walking policy's training on one GPU beside their goals."""
     of = {r["name"].removeprefix("walk_train/").split("/", 1)[-1]: r for r in report["rows"]}
-    lines = []
-    for name, label in LABELS.items():
+
+    def figure(name: str) -> str:
         unit = f" {of[name]['unit']}".removesuffix(" 1")
-        lines.append((label, f"{of[name]['value']:,}{unit}", of[name]["goal"] + ", missed" * missed(of[name])))
-    return markdown(("", "measured", "goal"), lines)
+        return f"{of[name]['value']:,}{unit}" + f" (goal {of[name]['goal']}, missed)" * missed(of[name])
+
+    return (
+        f"{of['steps']['value'] / 1e6:.0f} million steps take {figure('command_s')} on one GPU from starting `train` "
+        f"to the saved policy, {figure('compile_s')} of them compilation: {figure('learnt_steps_per_s')}. Once on a "
+        f"machine, Warp's kernels take {figure('kernels_s')} more. The policy falls on {figure('calm/falls')} "
+        f"twins; its errors are {figure('calm/error_m_s')} and {figure('calm/error_rad_s')}. With pushes it falls on "
+        f"{figure('pushed/falls')}.\n"
+    )
 
 
 def first_step() -> float:
