@@ -7,6 +7,7 @@ import numpy as np
 from sim2real.emulation.truth import Kind
 from sim2real.hardware.device import OperatingMode
 from sim2real.policy import PolicyContract, save_bundle
+from sim2real.policy.contract import observation_size
 from sim2real.stages.load import load_robot
 
 TINY = [
@@ -26,13 +27,16 @@ def manifest_of(folder):
 def make_bundle(name, folder, bias=0.0, slope=0.0):
     """Write a bundle whose policy gives the same action always, or one that grows with the third observation."""
     robot = load_robot(name)
-    size, low, high = robot.agent.observation_size, *np.array([(a.low, a.high) for a in robot.agent.action]).T
+    size, low, high = (
+        observation_size(robot.task.observation),
+        *np.array([(a.low, a.high) for a in robot.task.action]).T,
+    )
     weights = {"mean": np.zeros(size), "std": np.ones(size), "low": low, "high": high, "log_std": np.zeros(len(low))}
     kernel = np.zeros((size, len(low)))
     kernel[2] = slope
     trained = {"round_trip_delay": (0.043, 0.047)} if name == "pendulum" else {}
-    terms = robot.agent.observation, robot.agent.action, robot.rate_hz
-    contract = PolicyContract(*terms, trained_s=trained, limits=dict(robot.agent.limits))
+    terms = robot.task.observation, robot.task.action, robot.rate_hz
+    contract = PolicyContract(*terms, trained_s=trained, limits=dict(robot.task.limits))
     layers = {"layers.0.kernel": kernel, "layers.0.bias": np.full(len(low), bias)}
     return save_bundle(folder / "bundle", weights | layers, contract)
 

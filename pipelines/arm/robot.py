@@ -17,7 +17,7 @@ from sim2real.robots.robot import Embedded, Robot
 from sim2real.robots.servo.model import Hand, ServoModel, friction_causes
 from sim2real.robots.servo.servos import DataSheet, JointSensor, ServoDrive, Servos
 from sim2real.robots.servo.targets import target_tasks
-from sim2real.robots.servo.task import Aim, AimTask, ServoAgent, ServoMoment, uniform
+from sim2real.robots.servo.task import Aim, AimTask, ServoMoment, uniform
 from sim2real.types import Array, Key
 
 SERVOS = Servos(
@@ -137,9 +137,8 @@ class ArmRobot(Robot):
     def __init__(self, servos: Servos = SERVOS) -> None:
         self.sensor = JointSensor(servos)
         self.drive = ServoDrive(servos, probe=Probe(step=0.12, lag_s=(0.008, 0.0115)), embedded=embedded)
-        self.agent = ServoAgent(servos, TARGET, FEATURES, observe)
         self.model = ServoModel(servos, MJCF, HAND, causes=friction_causes(servos.joints))
-        self.task = AimTask(servos, TARGET, reward, success, score)
+        self.task = AimTask(servos, TARGET, reward, success, score, FEATURES, observe)
         self.tasks = target_tasks(replace(servos, speed=FAST_RAD_S), tip_of, way, (LOW, HIGH), CENTRES)
 
 

@@ -9,15 +9,15 @@ import numpy as np
 
 from sim2real.arrays import namespace
 from sim2real.errors import SafetyStop
+from sim2real.graph.base import GraphState
 from sim2real.identification.model import Channel, PlainSimulation
 from sim2real.identification.parameters import Parameter
 from sim2real.later import jax, jnp
 from sim2real.policy.contract import ActionTerm, ObservationTerm
-from sim2real.robots.agent import AgentParams
 from sim2real.robots.loop import Draw
 from sim2real.robots.messages import EpisodeStart
 from sim2real.robots.probe import Probe
-from sim2real.robots.robot import Embedded, Robot, RobotAgent, RobotDrive, RobotModel, RobotSensor, RobotTask
+from sim2real.robots.robot import Embedded, Judgement, Robot, RobotDrive, RobotModel, RobotSensor, RobotTask
 from sim2real.types import Key, Scalar
 
 from .mjcf import HINGE, STEP_S, mjcf_of
@@ -128,24 +128,6 @@ class HingeDrive(RobotDrive):
         )
 
 
-class HingeAgent(RobotAgent):
-    """A voltage from the angle, the speed, and a short history of both and of the voltage."""
-
-    observation = (
-        ObservationTerm("cos(th), sin(th), thdot / 10", _UNITS, low=_LOW, high=_HIGH),
-        ObservationTerm("past cos(th), sin(th), thdot / 10", _UNITS, HISTORY, _LOW, _HIGH),
-        ObservationTerm("past voltage", ("V",), HISTORY, (-LIMIT_V,), (LIMIT_V,)),
-    )
-    action = (ActionTerm("voltage", "V", -LIMIT_V, LIMIT_V),)
-
-    def make(self, rate_hz: float, **options: Any) -> Agent:
-        return Agent("agent", rate_hz, **options)
-
-    def params(self, start: EpisodeStart, policy: Any) -> AgentParams:
-        del start
-        return AgentParams(policy=policy)
-
-
 class HingeModel(RobotModel):
     """The pendulum as a differential equation, with four groups of parameters."""
 
@@ -192,7 +174,20 @@ class HingeModel(RobotModel):
 
 
 class SwingUp(RobotTask):
-    """Swing up, and stay upright; every trial is the same."""
+    """Swing up, and stay upright; every trial is the same.
+
+    The policy sets a voltage from the angle, the speed, and a short history of both and of the voltage.
+    """
+
+    observation = (
+        ObservationTerm("cos(th), sin(th), thdot / 10", _UNITS, low=_LOW, high=_HIGH),
+        ObservationTerm("past cos(th), sin(th), thdot / 10", _UNITS, HISTORY, _LOW, _HIGH),
+        ObservationTerm("past voltage", ("V",), HISTORY, (-LIMIT_V,), (LIMIT_V,)),
+    )
+    action = (ActionTerm("voltage", "V", -LIMIT_V, LIMIT_V),)
+
+    def make_agent(self, rate_hz: float, **options: Any) -> Agent:
+        return Agent("agent", rate_hz, **options)
 
     def random(self, key: Key, draw: Draw) -> tuple[dict[str, Any], EpisodeStart]:
         k_values, k_state, k_where = jax.random.split(key, 3)
@@ -200,22 +195,21 @@ class SwingUp(RobotTask):
         anywhere = jax.random.uniform(k_state, (2,), minval=-1.0, maxval=1.0) * jnp.array([jnp.pi, 9.0])
         hanging = jnp.array([jnp.pi, 0.0]) + 0.05 * anywhere
         start = jnp.where(jax.random.bernoulli(k_where), hanging, anywhere)
-        return values, EpisodeStart(start[:1], start[1:], jnp.zeros(0))
+        return values, EpisodeStart(start[:1], start[1:], jnp.zeros(0), jnp.zeros(1))
 
     def at_rest(self, trial: int) -> EpisodeStart:
         del trial
-        return EpisodeStart(np.array([np.pi]), np.zeros(1), np.zeros(0))
+        return EpisodeStart(np.array([np.pi]), np.zeros(1), np.zeros(0), np.zeros(1))
 
-    def reward(self, state: Measurement, action: jax.Array) -> dict[str, jax.Array]:
+    def judge(self, graph_state: GraphState, action: jax.Array) -> Judgement:
+        state = graph_state.state["world"]
         th = state.th - 2 * jnp.pi * jnp.floor((state.th + jnp.pi) / (2 * jnp.pi))
-        return {
+        reward = {
             "angle": -(th**2),
             "speed": -0.1 * (state.thdot / (1 + 10 * jnp.abs(th))) ** 2,
             "voltage": -0.01 * action[0] ** 2,
         }
-
-    def success(self, state: Measurement) -> jax.Array:
-        return upright(state.th, state.thdot)
+        return Judgement(reward, upright(state.th, state.thdot))
 
     def score(self, t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float]:
         """Return how well the pendulum was swung up and held.
@@ -243,7 +237,6 @@ class PendulumRobot(Robot):
     def __init__(self, mounting: tuple[Joint, ...] = ()) -> None:
         self.sensor = HingeSensor()
         self.drive = HingeDrive(mounting)
-        self.agent = HingeAgent()
         self.model = HingeModel()
         self.task = SwingUp()
 

@@ -22,7 +22,7 @@ from sim2real.robots.robot import Embedded, Robot
 from sim2real.robots.servo.model import Hand, ServoModel, friction_causes, goal_offsets, servo_parameters
 from sim2real.robots.servo.servos import JointSensor, ServoDrive, Servos, StsSheet
 from sim2real.robots.servo.targets import target_tasks
-from sim2real.robots.servo.task import Aim, AimTask, ServoAgent, ServoMoment, uniform
+from sim2real.robots.servo.task import Aim, AimTask, ServoMoment, uniform
 from sim2real.types import Array, Key
 
 if TYPE_CHECKING:
@@ -100,10 +100,9 @@ class SO101Robot(Robot):
         probe = Probe(step=0.12, lag_s=(-0.009, -0.004))
         self.sensor = JointSensor(servos)
         self.drive = ServoDrive(servos, probe=probe, embedded=embedded, settings=settings)
-        self.agent = ServoAgent(servos, TARGET, FEATURES, observe)
         more: dict[str, Any] = {"dynamics": dynamics, "causes": friction_causes(JOINTS)}
         self.model = ServoModel(servos, MJCF, HAND, step_s=STEP_S, **more)
-        self.task = AimTask(servos, TARGET, reward, success, score)
+        self.task = AimTask(servos, TARGET, reward, success, score, FEATURES, observe)
         self.tasks = target_tasks(replace(servos, speed=FAST_RAD_S), tip_of, way, (LOW, HIGH), CENTRES, still=(4, 5))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TypeVar
 
 import msgspec
@@ -72,6 +72,11 @@ class ObservationTerm:
     def size(self) -> int:
         """Number of entries of one step."""
         return len(self.units)
+
+
+def observation_size(terms: Sequence[ObservationTerm]) -> int:
+    """Return the number of entries of an observation of terms."""
+    return sum(term.size * term.history for term in terms)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -154,7 +159,7 @@ class PolicyContract:
     @property
     def observation_size(self) -> int:
         """Number of entries of the observation vector."""
-        return sum(term.size * term.history for term in self.observation)
+        return observation_size(self.observation)
 
     @property
     def observation_names(self) -> list[str]:

@@ -17,7 +17,7 @@ from sim2real.arrays import namespace
 from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.node import BaseNode, NodeOptions
 from sim2real.robots.loop import SENSOR
-from sim2real.robots.messages import Decision, JointReading
+from sim2real.robots.messages import Decision, EpisodeStart, JointReading
 from sim2real.types import Array, Key, PyTree, Scalar
 
 
@@ -35,6 +35,12 @@ class AgentParams(Base):
     policy: PyTree = None
     aim: Array | None = None
     start: Array | None = None
+
+    @classmethod
+    def of(cls, start: EpisodeStart, policy: PyTree = None) -> AgentParams:
+        """Return the parameters of an episode with a start."""
+        command = start.position if start.command is None else start.command
+        return cls(policy, start.aim, namespace(command).asarray(command, np.float32))
 
 
 @pytree.dataclass

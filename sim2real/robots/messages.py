@@ -50,8 +50,10 @@ class EpisodeStart(Base):
         position: Shape ``(channels,)``: positions of the joints [rad].
         velocity: Shape ``(channels,)`` [rad/s].
         aim: Shape ``(k,)``: the task's aim, e.g. a target's position ``(3,)`` [m].
+        command: Shape ``(actions,)``: the command before the first step; None: the positions are.
     """
 
     position: Array
     velocity: Array
     aim: Array
+    command: Array | None = None

@@ -20,6 +20,7 @@ from sim2real.graph.base import Base, GraphState, StepState, Value
 from sim2real.graph.node import BaseNode, NodeOptions
 from sim2real.later import jax, jnp
 from sim2real.policy.runner import Runner
+from sim2real.robots.agent import AgentParams, PolicyAgent
 from sim2real.robots.loop import ACTUATOR, AGENT, SENSOR, DelayParams, control_nodes, delay_of
 from sim2real.robots.messages import Goals
 from sim2real.types import Array, Key, PyTree
@@ -288,12 +289,12 @@ class PolicyNode(BaseNode):
     The agent makes observations and messages, from numpy arrays; its own ``step`` is not called.
 
     Args:
-        agent: The agent's node, with ``observe(step_state)`` and ``act(step_state, action)``; it is left unconnected.
+        agent: The agent's node; it is left unconnected.
     """
 
     jittable = False
 
-    def __init__(self, agent: Any, runner: Runner) -> None:
+    def __init__(self, agent: PolicyAgent, runner: Runner) -> None:
         super().__init__(agent.name, agent.rate, delay=agent.delay, delay_dist=agent.delay_dist)
         self._agent, self._runner = agent, runner
 
@@ -380,7 +381,7 @@ def recording_nodes(robot: Robot, rig: Rig, signal: np.ndarray | None, standing:
     if signal is None:
         return {SENSOR: _sensor(robot, rig)}
     drive = robot.drive
-    rows = np.asarray(signal, np.float64).reshape(-1, len(robot.agent.action)) + drive.centre
+    rows = np.asarray(signal, np.float64).reshape(-1, len(robot.task.action)) + drive.centre
     if not standing and robot.units.get(drive.command) == "rad":
         rows = approached(rows, rig.wait_until_still(_HANG_S, _STILL_RAD_S).position_rad, drive.rate_hz)
     player = Excitation(AGENT, drive.rate_hz, rows, drive.message, delay=drive.expected_delay_s[1])
@@ -397,8 +398,8 @@ def deployment_nodes(
     """
     drive, measured = robot.drive, np.asarray(rig.measure().position_rad, np.float32)
     start = robot.task.at_rest(trial).replace(position=measured)
-    params = {AGENT: in_numpy(robot.agent.params(start, None))}
-    node = PolicyNode(robot.agent.make(drive.rate_hz, delay=drive.expected_delay_s[1]), policy)
+    params = {AGENT: in_numpy(AgentParams.of(start))}
+    node = PolicyNode(robot.task.make_agent(drive.rate_hz, delay=drive.expected_delay_s[1]), policy)
     return _on_hardware(robot, rig, node, lambda: drive.begin(rig)), params
 
 

@@ -1,7 +1,7 @@
 """A robot for the stages, on one page: ``ROBOT = MyRobot()`` in ``pipelines/NAME/robot.py``.
 
-A robot that was only recorded is a ``RecordedRobot``: what identification needs. A ``Robot`` has five parts besides: a
-sensor, a drive, an agent, a task and a model, and connects them to graphs. Each part inherits its class here; Python
+A robot that was only recorded is a ``RecordedRobot``: what identification needs. A ``Robot`` has four parts besides: a
+sensor, a drive, a task and a model, and connects them to graphs. Each part inherits its class here; Python
 refuses one without the methods that have no default.
 """
 
@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Self, TypeVar, Unpack
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeVar, Unpack
 
 import numpy as np
 
@@ -22,8 +22,9 @@ from sim2real.graph.base import GraphState
 from sim2real.graph.node import BaseNode, NodeOptions
 from sim2real.identification.model import Channel, IdentifiableModel, PlainSimulation, position_of
 from sim2real.identification.parameters import Parameter
-from sim2real.later import jax, jnp
-from sim2real.policy.contract import ActionTerm, ObservationTerm
+from sim2real.later import jax
+from sim2real.policy.contract import ActionTerm, ObservationTerm, observation_size
+from sim2real.robots.agent import PolicyAgent
 from sim2real.robots.loop import WORLD, Draw
 from sim2real.robots.messages import EpisodeStart
 from sim2real.robots.probe import Probe
@@ -165,40 +166,38 @@ class RobotDrive(ABC):
         return limits.gate(limits.limit)
 
 
-class RobotAgent(ABC):
-    """The observation and the action of the policy.
+class Judgement(NamedTuple):
+    """What a task says of the state after a policy step.
+
+    Attributes:
+        reward: A number, or terms by name, which are added up.
+        success: Whether the task is fulfilled, bool.
+        ended: Whether the episode ends, such as after a fall, bool.
+    """
+
+    reward: Rewards
+    success: jax.Array
+    ended: jax.Array | bool = False
+
+
+class RobotTask(ABC):
+    """What a policy sees and does; the starts and the rewards of its episodes.
 
     Attributes:
         observation: Terms of the policy's observation, in order.
         action: The policy's actions, in order, with their bounds.
         limits: Name -> limit that a policy is trained for, such as the ends of the joints' goals.
         units: Field of the agent's message -> its unit, beside the command.
-        tilt_rad: Returns the robot's tilt from an observation ``(O,)``, for ``deploy --max-tilt-rad`` [rad];
-            None: the robot does not measure that.
     """
 
     observation: tuple[ObservationTerm, ...]
     action: tuple[ActionTerm, ...]
     limits: Mapping[str, float] = _NOTHING
     units: Mapping[str, str] = _NOTHING
-    tilt_rad: Callable[[np.ndarray], float] | None = None
-
-    @property
-    def observation_size(self) -> int:
-        """Number of entries of the policy's observation."""
-        return sum(term.size * term.history for term in self.observation)
 
     @abstractmethod
-    def make(self, rate_hz: float, **options: Unpack[NodeOptions]) -> BaseNode:
-        """Return the policy's node, with ``observe`` and ``act``; see ``PolicyNode``."""
-
-    @abstractmethod
-    def params(self, start: EpisodeStart, policy: PyTree) -> PyTree:
-        """Return the node's parameters for an episode."""
-
-
-class RobotTask(ABC):
-    """The starts and the rewards of episodes."""
+    def make_agent(self, rate_hz: float, **options: Unpack[NodeOptions]) -> PolicyAgent:
+        """Return the policy's node."""
 
     @abstractmethod
     def random(self, key: Key, draw: Draw) -> tuple[dict[str, PyTree], EpisodeStart]:
@@ -220,25 +219,13 @@ class RobotTask(ABC):
         """
         return start.replace(position=start.position + position, velocity=start.velocity + velocity)
 
-    def judged(self, graph_state: GraphState) -> PyTree:
-        """Return the state that ``reward``, ``success`` and ``terminated`` evaluate; default: the world's."""
-        return graph_state.state[WORLD]
-
     @abstractmethod
-    def reward(self, state: PyTree, action: jax.Array) -> Rewards:
-        """Return the reward of a policy step: a number, or terms by name, which are added up.
+    def judge(self, graph_state: GraphState, action: jax.Array) -> Judgement:
+        """Return reward, success and end of a policy step, from the state after it.
 
         Args:
             action: Shape ``(actions,)``.
         """
-
-    @abstractmethod
-    def success(self, state: PyTree) -> jax.Array:
-        """Return whether the task is fulfilled, bool."""
-
-    def terminated(self, state: PyTree) -> jax.Array:
-        """Return whether the episode ends, such as after a fall, bool; default: never."""
-        return jnp.bool_(False)
 
     @abstractmethod
     def score(self, t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float]:
@@ -367,18 +354,17 @@ class RecordedRobot(ABC):
 
 
 class Robot(RecordedRobot):
-    """A robot that can be recorded, trained for and deployed to. It has five parts, which its ``__init__`` sets.
+    """A robot that can be recorded, trained for and deployed to. It has four parts, which its ``__init__`` sets.
 
     Attributes:
-        tasks: Further tasks by name, each with its agent; see ``with_task``.
+        tasks: Further tasks by name; see ``with_task``.
     """
 
     drive: RobotDrive
     sensor: RobotSensor
-    agent: RobotAgent
     task: RobotTask
     model: RobotModel
-    tasks: Mapping[str, tuple[RobotAgent, RobotTask]] = _NOTHING
+    tasks: Mapping[str, RobotTask] = _NOTHING
 
     @property
     def rate_hz(self) -> float:
@@ -387,7 +373,7 @@ class Robot(RecordedRobot):
 
     @property
     def units(self) -> Mapping[str, str]:
-        return {**self.sensor.units, **self.drive.units, **self.agent.units}
+        return {**self.sensor.units, **self.drive.units, **self.task.units}
 
     @property
     def simulated(self) -> RobotModel:
@@ -411,14 +397,13 @@ class Robot(RecordedRobot):
                 f"robot {self.name!r} has no further task {name!r}. Available: {', '.join(self.tasks) or 'none'}"
             )
         robot = copy.copy(self)
-        robot.agent, robot.task = self.tasks[name]
+        robot.task = self.tasks[name]
         return robot
 
 
 PARTS: Mapping[str, type] = {
     "sensor": RobotSensor,
     "drive": RobotDrive,
-    "agent": RobotAgent,
     "task": RobotTask,
     "model": RobotModel,
 }
@@ -435,7 +420,7 @@ def checked(robot: Any, where: str) -> RecordedRobot:
         raise UsageError(
             f"ROBOT of {where} is {'missing' if robot is None else repr(robot)}: a robot is an object of a class that "
             "inherits from sim2real.robots.robot.Robot, or from RecordedRobot where there are recordings only",
-            hint="write a class with the five parts of a Robot, and end with `ROBOT = MyRobot()`",
+            hint="write a class with the four parts of a Robot, and end with `ROBOT = MyRobot()`",
         )
     gaps: list[str] = []
     if isinstance(robot, Robot):
@@ -495,6 +480,19 @@ def in_world(robot: AnyRobot, name: str | None) -> AnyRobot:
     robot = copy.copy(robot)
     robot.model = model
     return robot
+
+
+GRAVITY = "gravity in the base's axes"
+"""Name of a term of the observation: the direction of gravity ``(3,)``, (0, 0, -1) while the robot is level."""
+
+
+def tilt_of(observation: Sequence[ObservationTerm]) -> Callable[[np.ndarray], float] | None:
+    """Return what makes the robot's tilt [rad] of an observation ``(O,)``; None: it has no term ``GRAVITY``."""
+    names = [term.name for term in observation]
+    if GRAVITY not in names:
+        return None
+    down = observation_size(observation[: names.index(GRAVITY)]) + 2
+    return lambda observed: float(np.arccos(np.clip(-observed[down], -1.0, 1.0)))
 
 
 def joint_columns(channels: Sequence[Channel]) -> Mapping[str, Mapping[str, str]]:

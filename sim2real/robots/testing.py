@@ -22,6 +22,7 @@ from sim2real.graph.schedule import draw
 from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.safety.gate import GateLimits
 from sim2real.identification.model import IdentifiableModel
+from sim2real.policy.contract import observation_size
 from sim2real.robots.loop import ACTUATOR, AGENT, SENSOR, WORLD
 from sim2real.robots.nodes import connected
 from sim2real.robots.robot import RecordedRobot, Robot, as_columns, as_sent, checked
@@ -80,7 +81,7 @@ def check_identification(robot: RecordedRobot, max_delay_s: float = 0.06) -> Non
 def check_simulation(robot: Robot) -> None:
     """Check names, shapes and scores by an episode in simulation at the nominal values; it is compiled."""
     # Parameters and nodes.
-    values, size = robot.nominal(), robot.agent.observation_size
+    values, size = robot.nominal(), observation_size(robot.task.observation)
     identifiable = {p.name: p for p in robot.identifiable(0.06).parameters}
     _include(identifiable, set(values), "parameters that can be identified")
     for name, value in values.items():
@@ -108,7 +109,7 @@ def check_simulation(robot: Robot) -> None:
     measured = as_columns(outputs[SENSOR])
     _include(outputs[ACTUATOR], {robot.drive.command}, "fields of a command")
     _include(robot.units, {*outputs[SENSOR], robot.drive.command}, "units")
-    command, actions = outputs[ACTUATOR][robot.drive.command], len(robot.agent.action)
+    command, actions = outputs[ACTUATOR][robot.drive.command], len(robot.task.action)
     width = command.reshape(len(command), -1).shape[1]
     _hold(width == actions, f"a command has {width} entries, and there are {actions} actions")
     _check_score(robot, measured, as_sent(robot, outputs[AGENT], outputs[ACTUATOR]))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Unpack
 
 import numpy as np
 
@@ -16,6 +16,8 @@ from sim2real.graph.episode import Episode, named_leaves
 from sim2real.graph.node import BaseNode, NodeOptions
 from sim2real.identification.parameters import ParameterTable
 from sim2real.later import jax, jnp
+from sim2real.policy.contract import observation_size
+from sim2real.robots.agent import AgentParams, PolicyAgent
 from sim2real.robots.loop import (
     ACTUATOR,
     AGENT,
@@ -51,13 +53,13 @@ def node_parameters(
         WORLD: robot.model.params(values, start),
         SENSOR: DelayParams(delay=values.get(DELAYS[0])),
         ACTUATOR: DelayParams(delay=values.get(DELAYS[1])),
-        AGENT: robot.agent.params(start, policy),
+        AGENT: AgentParams.of(start, policy),
     }
 
 
 def _sim_actuator(robot: Robot, **options: Unpack[NodeOptions]) -> SimActuator:
     drive = robot.drive
-    return SimActuator(ACTUATOR, drive.rate_hz, len(robot.agent.action), drive.command, drive.message, **options)
+    return SimActuator(ACTUATOR, drive.rate_hz, len(robot.task.action), drive.command, drive.message, **options)
 
 
 def _lead_s(world: BaseNode) -> float:
@@ -96,7 +98,10 @@ def training_loop(
         {"delay": delay_s if delays else 0.0, "delay_dist": computation.get(name)}
         for name, delay_s in zip((SENSOR, AGENT, ACTUATOR), drive.expected_delay_s, strict=True)
     )
-    agent, sensor = robot.agent.make(drive.rate_hz, **on_agent), SimSensor(SENSOR, drive.rate_hz, world, **on_sensor)
+    agent, sensor = (
+        robot.task.make_agent(drive.rate_hz, **on_agent),
+        SimSensor(SENSOR, drive.rate_hz, world, **on_sensor),
+    )
     sensor.noise = robot.sensor.noise
     nodes = simulated_loop(sensor, agent, _sim_actuator(robot, **on_actuator), world, bounds)
     return nodes, LoopTask(robot, agent, values, draws)
@@ -135,13 +140,15 @@ class LoopTask(TrainingTask):
     supervisor = AGENT
     has_curriculum = True
 
-    def __init__(self, robot: Robot, agent: Any, values: Mapping[str, float], draws: Mapping[str, np.ndarray]) -> None:
+    def __init__(
+        self, robot: Robot, agent: PolicyAgent, values: Mapping[str, float], draws: Mapping[str, np.ndarray]
+    ) -> None:
         self.robot, self.agent = robot, agent
         self.values: dict[str, PyTree] = dict(values)
         self.draws = {n: jnp.asarray(d, jnp.float32) for n, d in draws.items()}
-        self.observation_size = robot.agent.observation_size
+        self.observation_size = observation_size(robot.task.observation)
         self.start = (0.0, 0.0)
-        self.action_low, self.action_high = np.array([(t.low, t.high) for t in robot.agent.action], np.float32).T
+        self.action_low, self.action_high = np.array([(t.low, t.high) for t in robot.task.action], np.float32).T
 
     @property
     def data(self) -> PyTree:
@@ -178,19 +185,19 @@ class LoopTask(TrainingTask):
         return self.start[0] * drawn[0], self.start[1] * drawn[1]
 
     def observe(self, step_state: StepState) -> jax.Array:
-        return self.agent.observe(step_state)
+        return jnp.asarray(self.agent.observe(step_state))
 
     def act(self, step_state: StepState, action: jax.Array) -> tuple[StepState, PyTree]:
         return self.agent.act(step_state, action)
 
     def reward(self, graph_state: GraphState, action: jax.Array) -> Rewards:
-        return self.robot.task.reward(self.robot.task.judged(graph_state), action)
+        return self.robot.task.judge(graph_state, action).reward
 
     def success(self, graph_state: GraphState) -> jax.Array:
-        return self.robot.task.success(self.robot.task.judged(graph_state))
+        return self.robot.task.judge(graph_state, jnp.zeros(len(self.action_low))).success
 
     def terminated(self, graph_state: GraphState) -> jax.Array:
-        return self.robot.task.terminated(self.robot.task.judged(graph_state))
+        return jnp.asarray(self.robot.task.judge(graph_state, jnp.zeros(len(self.action_low))).ended)
 
     def privileged(self, graph_state: GraphState) -> jax.Array:
         state = self.robot.model.true_state(graph_state.state[WORLD])

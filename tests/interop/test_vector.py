@@ -14,6 +14,7 @@ from gymnasium.utils.env_checker import check_env  # noqa: E402
 from sim2real.errors import Sim2RealError, UsageError  # noqa: E402
 from sim2real.interop import baselines_env, robot_environment, vector_env  # noqa: E402
 from sim2real.interop.baselines import to_baselines  # noqa: E402
+from sim2real.policy.contract import observation_size  # noqa: E402
 from sim2real.stages.load import load_robot  # noqa: E402
 
 COPIES = 3
@@ -47,7 +48,7 @@ def play(env, seed, steps):
 def test_every_entry_has_a_name_a_unit_and_bounds(name):
     robot = robot_environment(name, "nominal")
     seen, done = robot.observation, robot.action
-    assert len(seen) == load_robot(name).agent.observation_size
+    assert len(seen) == observation_size(load_robot(name).task.observation)
     assert len({e.name for e in seen}) == len(seen)
     assert all(e.unit and math.isfinite(e.low) and e.low < e.high < math.inf for e in (*seen, *done))
     assert len(done) == {"pendulum": 1, "arm": 3, "so101": 6}[name]

@@ -12,9 +12,9 @@ import pytest
 
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, InputState, StepState
+from sim2real.robots.agent import AgentParams
 from sim2real.robots.messages import JointReading
 from sim2real.robots.servo.targets import AHEAD_S, FIGURE_HZ, FIGURE_M, arrival, figure_of_eight
-from sim2real.robots.servo.task import ServoMoment
 from sim2real.stages.load import load_module, load_robot
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
@@ -79,16 +79,24 @@ def test_every_point_of_the_drawn_figures_is_within_reach(arm):
             assert off < 1e-3, (trial, t_s)
 
 
+def state_of(position, t_s, aim):
+    """Return a graph's state at a time [s] of an episode with an aim."""
+    still = jnp.zeros(len(position))
+    world = SimpleNamespace(position=jnp.asarray(position), velocity=still, time_s=jnp.float32(t_s))
+    return GraphState(state={"world": world}, params={"agent": AgentParams(aim=aim)})
+
+
 def test_reward_and_success_are_those_of_the_target_now(arm):
     for name in ("follow", "fast"):
         task = arm.robot.with_task(name).task
 
         def judged(turn, task=task):
             now = arm.there + turn * np.eye(len(arm.there))[0]
-            aim = jnp.concatenate([arm.tip_of(jnp.asarray(arm.there)), jnp.full(3, 9.0)])
-            moment = ServoMoment(jnp.asarray(now), jnp.zeros(len(now)), aim[: len(task.aim.entries)])
-            terms = task.reward(moment, jnp.zeros(len(now)))
-            return float(terms["task"]), bool(task.success(moment))
+            aim, t_s = jnp.asarray(arm.tip_of(jnp.asarray(arm.there))), 0.0
+            if task.aim.at is not None:  # where the figure is over its centre
+                aim, t_s = jnp.append(aim, 0.0), 1 / FIGURE_HZ
+            found = task.judge(state_of(now, t_s, aim), jnp.zeros(len(now)))
+            return float(found.reward["task"]), bool(found.success)
 
         best, near, far = (judged(turn) for turn in (0.0, 0.1, 0.8))
         assert best[0] == pytest.approx(3.0, abs=1e-3)
@@ -99,7 +107,7 @@ def test_reward_and_success_are_those_of_the_target_now(arm):
 def test_the_policy_sees_the_target_of_its_step_and_the_task_judges_that_of_the_worlds_time(arm):
     robot = arm.robot.with_task("follow")
     start = robot.task.at_rest(3)
-    node, params = robot.agent.make(50.0), robot.agent.params(start, None)
+    node, params = robot.task.make_agent(50.0), AgentParams.of(start)
     state = node.init_state(None, GraphState(params={"agent": params}))
     zero, now = np.zeros(1), np.asarray(arm.there, np.float32)
     heard = InputState(np.zeros(1, np.int32), zero, zero, JointReading(now[None], np.zeros((1, len(now)))))
@@ -112,16 +120,20 @@ def test_the_policy_sees_the_target_of_its_step_and_the_task_judges_that_of_the_
             assert np.linalg.norm(seen[3 * i : 3 * i + 3]) == pytest.approx(
                 10 * np.linalg.norm(point - arm.tip_of(now)), rel=1e-4
             )
-        world = SimpleNamespace(position=now, velocity=0 * now, time_s=jnp.float32(k / 50.0))
-        moment = robot.task.judged(GraphState(state={"world": world}, params={"agent": params}))
-        np.testing.assert_allclose(moment.aim, np.concatenate(at), atol=1e-5)
+        q, off = joints_at(arm, at[0], arm.there)
+        assert off < 1e-3
+        there, ahead = (
+            robot.task.judge(state_of(q, t_s, start.aim), jnp.zeros(len(now))).reward["task"]
+            for t_s in (k / 50.0, k / 50.0 + AHEAD_S)
+        )
+        assert there > 2.9 > ahead
 
 
 def test_a_robot_has_its_tasks_by_name_and_refuses_another(arm):
     assert set(arm.robot.tasks) == {"follow", "fast"}
     fast = arm.robot.with_task("fast")
     assert (fast.name, fast.model) == (arm.robot.name, arm.robot.model)
-    assert fast.agent.action[0].high > arm.robot.agent.action[0].high
+    assert fast.task.action[0].high > arm.robot.task.action[0].high
     assert arm.robot.task is not fast.task
     with pytest.raises(UsageError, match="juggle"):
         arm.robot.with_task("juggle")

@@ -12,7 +12,7 @@ from sim2real.robots.messages import EpisodeStart, Goals
 from sim2real.robots.robot import Robot
 from sim2real.robots.servo.model import ServoModel
 from sim2real.robots.servo.servos import DataSheet, JointSensor, ServoDrive, Servos
-from sim2real.robots.servo.task import Aim, AimTask, ServoAgent, uniform
+from sim2real.robots.servo.task import Aim, AimTask, uniform
 
 MJCF = Path(__file__).with_name("pair.xml")
 SHEET = DataSheet(stall=1.4, damping=0.2, armature=0.01, friction=0.02, p_gain=1200, profile_rad_s=2.0)
@@ -27,9 +27,8 @@ class PairRobot(Robot):
     def __init__(self, servos=SERVOS, aim=ANGLE, features=None, observe=None, history=2, converged=False):
         self.sensor = JointSensor(servos)
         self.drive = ServoDrive(servos)
-        self.agent = ServoAgent(servos, aim, features, observe, history)
         self.model = (Converged if converged else ServoModel)(servos, MJCF, step_s=0.005)
-        self.task = AimTask(servos, aim, reward, success, score)
+        self.task = AimTask(servos, aim, reward, success, score, features, observe, history)
 
 
 class Converged(ServoModel):

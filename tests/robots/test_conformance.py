@@ -5,6 +5,7 @@ import pytest
 
 from sim2real.identification.model import Channel
 from sim2real.robots import testing
+from sim2real.robots.robot import Judgement
 from sim2real.stages.load import load_robot
 
 
@@ -41,12 +42,12 @@ def pendulum(part=None, **changes):
         ("task", {"score": lambda _, t_s, states: {"success": np.nan}}, "success is nan, not a share"),
         (
             "task",
-            {"reward": lambda _, state, action: {"voltage": action}},
+            {"judge": lambda _, state, action: Judgement({"voltage": action}, action[0] > 0)},
             r"reward 'voltage' of a state has shape \(1,\)",
         ),
         (
-            "agent",
-            {"observation": load_robot("pendulum").agent.observation[:2]},
+            "task",
+            {"observation": load_robot("pendulum").task.observation[:2]},
             r"an observation has shape \(19,\), not \(15,\)",
         ),
     ],

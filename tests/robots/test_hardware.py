@@ -209,9 +209,9 @@ def test_a_robot_without_an_embedded_twin_has_no_such_port(pair, tmp_path):
 def test_no_command_leaps_where_a_recording_outlasts_its_excitation(name):
     """A Go2 on its feet was told to stretch all legs for the last one or two steps of each log of its load."""
     robot = moving(load_robot(name))
-    rest = SimpleNamespace(position_rad=np.full(len(robot.agent.action), 0.1))
+    rest = SimpleNamespace(position_rad=np.full(len(robot.task.action), 0.1))
     rig = SimpleNamespace(measure=lambda: rest, wait_until_still=lambda *_: rest)
-    signal = 0.5 + 0.1 * np.linspace(0.0, 1.0, 100)[:, None] * np.ones(len(robot.agent.action))
+    signal = 0.5 + 0.1 * np.linspace(0.0, 1.0, 100)[:, None] * np.ones(len(robot.task.action))
     agent = recording_nodes(robot, rig, signal, standing=name == "go2")["agent"]
     played = np.array([getattr(agent.step(SimpleNamespace(seq=k))[1], robot.drive.command) for k in range(200)])
     assert np.abs(np.diff(played[98:], axis=0)).max() < 0.03

@@ -8,6 +8,7 @@ import pytest
 from sim2real.graph.base import GraphState, InputState, StepState
 from sim2real.policy import ActionTerm, PolicyContract
 from sim2real.policy.bundle import make_runner
+from sim2real.policy.contract import observation_size
 from sim2real.robots.loop import SENSOR
 from sim2real.robots.nodes import PolicyNode, in_numpy
 from sim2real.stages.load import load_robot
@@ -24,8 +25,8 @@ def robot(request):
 @pytest.fixture(scope="module")
 def weights(robot):
     rng = np.random.default_rng(0)
-    size, n = robot.agent.observation_size, len(robot.agent.action)
-    low, high = (np.array([getattr(a, side) for a in robot.agent.action], np.float32) for side in ("low", "high"))
+    size, n = observation_size(robot.task.observation), len(robot.task.action)
+    low, high = (np.array([getattr(a, side) for a in robot.task.action], np.float32) for side in ("low", "high"))
     kernels = {"layers.0.kernel": rng.normal(size=(size, 8)) / size, "layers.1.kernel": rng.normal(size=(8, n)) / 8}
     biases = {"layers.0.bias": rng.normal(size=8), "layers.1.bias": np.zeros(n)}
     own = {"mean": np.zeros(size), "std": np.ones(size), "low": low, "high": high, "log_std": np.zeros(n)}
@@ -34,9 +35,9 @@ def weights(robot):
 
 @pytest.fixture(scope="module")
 def runner(robot, weights):
-    bounds = zip(robot.agent.action, weights["low"].tolist(), weights["high"].tolist(), strict=True)
+    bounds = zip(robot.task.action, weights["low"].tolist(), weights["high"].tolist(), strict=True)
     actions = tuple(ActionTerm(a.name, a.unit, low, high) for a, low, high in bounds)
-    return make_runner(weights, PolicyContract(robot.agent.observation, actions, robot.rate_hz))
+    return make_runner(weights, PolicyContract(robot.task.observation, actions, robot.rate_hz))
 
 
 def steps_of(node, robot, policy):
@@ -59,15 +60,15 @@ def leaves(tree):
 
 
 def test_it_does_what_the_agent_does_with_the_policy_in_jax(robot, weights, runner):
-    found, _ = steps_of(PolicyNode(robot.agent.make(robot.rate_hz), runner), robot, None)
-    expected, _ = steps_of(robot.agent.make(robot.rate_hz), robot, Policy.from_weights(weights))
+    found, _ = steps_of(PolicyNode(robot.task.make_agent(robot.rate_hz), runner), robot, None)
+    expected, _ = steps_of(robot.task.make_agent(robot.rate_hz), robot, Policy.from_weights(weights))
     for ours, theirs in zip(found, expected, strict=True):
         for a, b in zip(leaves(ours), leaves(theirs), strict=True):
             np.testing.assert_allclose(a, b, atol=1e-5)
 
 
 def test_a_step_on_the_robot_calls_nothing_of_jax(robot, runner, monkeypatch):
-    node = PolicyNode(robot.agent.make(robot.rate_hz), runner)
+    node = PolicyNode(robot.task.make_agent(robot.rate_hz), runner)
     params = in_numpy(node.init_params(None, GraphState()))
     state = node.init_state(None, GraphState(params={node.name: params}))
 
@@ -84,5 +85,5 @@ def test_a_step_on_the_robot_calls_nothing_of_jax(robot, runner, monkeypatch):
 def test_an_episode_begins_with_a_reset(robot, runner, monkeypatch):
     begun = []
     monkeypatch.setattr(runner, "reset", lambda: begun.append(1), raising=False)
-    PolicyNode(robot.agent.make(robot.rate_hz), runner).startup(GraphState())
+    PolicyNode(robot.task.make_agent(robot.rate_hz), runner).startup(GraphState())
     assert begun == [1]

@@ -14,6 +14,7 @@ from sim2real import cli
 from sim2real.commands.play import PlayConfig, run
 from sim2real.errors import UsageError
 from sim2real.policy.bundle import load_bundle
+from sim2real.policy.contract import observation_size
 from sim2real.robots.walking.drive import gravity_of
 from sim2real.robots.walking.task import Commands
 from sim2real.robots.walking.twin import HiddenTwin, Twin, walk
@@ -41,8 +42,8 @@ def test_commands_follow_one_another_and_some_are_zero():
 
 def test_the_observation_is_the_contract_of_the_bundle():
     contract = load_bundle(BUNDLE).contract
-    assert contract.observation_size == ROBOT.agent.observation_size
-    assert [t.name for t in contract.observation] == [t.name for t in ROBOT.agent.observation]
+    assert contract.observation_size == observation_size(ROBOT.task.observation)
+    assert [t.name for t in contract.observation] == [t.name for t in ROBOT.task.observation]
     assert [t.name for t in contract.action] == list(ROBOT.joints)
 
 

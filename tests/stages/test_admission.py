@@ -30,13 +30,13 @@ def still(contract):
 
 def contract_of(robot, /, **changes):
     """Return the contract of a policy that fits, but for some changes."""
-    bounds = [(float(np.float32(a.low)), float(np.float32(a.high))) for a in robot.agent.action]
-    actions = tuple(replace(a, low=low, high=high) for a, (low, high) in zip(robot.agent.action, bounds, strict=True))
+    bounds = [(float(np.float32(a.low)), float(np.float32(a.high))) for a in robot.task.action]
+    actions = tuple(replace(a, low=low, high=high) for a, (low, high) in zip(robot.task.action, bounds, strict=True))
     fits = {
-        "observation": robot.agent.observation,
+        "observation": robot.task.observation,
         "action": actions,
         "rate_hz": robot.rate_hz,
-        "limits": robot.agent.limits,
+        "limits": robot.task.limits,
     }
     return PolicyContract(**{**fits, **changes})
 
@@ -88,7 +88,7 @@ def test_a_policy_for_another_robot_is_refused(arm, what):
 
 def test_a_pendulum_policy_may_not_ask_for_100_volts():
     robot = load_robot("pendulum")
-    contract = contract_of(robot, action=(replace(robot.agent.action[0], low=-100.0, high=100.0),))
+    contract = contract_of(robot, action=(replace(robot.task.action[0], low=-100.0, high=100.0),))
     with pytest.raises(Sim2RealError, match="this robot allows -2 to 2"):
         admit(robot, contract)
 

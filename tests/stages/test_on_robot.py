@@ -18,6 +18,7 @@ from sim2real.emulation.truth import Kind, read_truth
 from sim2real.hardware.device import OperatingMode
 from sim2real.log.reader import read_log
 from sim2real.robots.nodes import Excitation
+from sim2real.stages.deploy import episodes, stage
 from sim2real.stages.load import load_module, load_robot
 from sim2real.stages.session import episode
 from sim2real.stages.session.excitation import played
@@ -98,9 +99,9 @@ def test_a_dry_run_sends_nothing_that_moves_and_is_no_recording(tmp_path):
 
 
 def test_a_robot_that_leans_too_far_is_stopped(tmp_path, monkeypatch):
-    agent = type(load_robot("pendulum").agent)
     from_hanging = lambda observation: float(np.arctan2(abs(observation[1]), -observation[0]))  # noqa: E731
-    monkeypatch.setattr(agent, "tilt_rad", staticmethod(from_hanging), raising=False)
+    for module in (episodes, stage):
+        monkeypatch.setattr(module, "tilt_of", lambda observation: from_hanging)
     bundle = make_bundle("pendulum", tmp_path, 0.6, slope=40.0)  # it pumps
     code, said, folder = deploy(
         tmp_path, "pendulum", bundle, "--max-tilt-rad", 1, "--duration-s", 10, "--no-measure-delay"

@@ -14,6 +14,7 @@ from sim2real.artifacts.posterior import Posterior
 from sim2real.artifacts.sensitivity import Moved, Sensitivity
 from sim2real.errors import Sim2RealError
 from sim2real.graph.schedule import draw
+from sim2real.policy.contract import observation_size
 from sim2real.robots.training import training_loop
 from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.stages.load import load_robot
@@ -57,8 +58,9 @@ class Holding(type(load_robot("pendulum").task)):
     def random(self, key, draw):
         return draw(key), self.at_rest(0)
 
-    def success(self, state):
-        return jnp.abs(jnp.abs(state.th - jnp.pi) - ANGLE_RAD) < NEAR_RAD
+    def judge(self, graph_state, action):
+        near = jnp.abs(jnp.abs(graph_state.state["world"].th - jnp.pi) - ANGLE_RAD) < NEAR_RAD
+        return super().judge(graph_state, action)._replace(success=near)
 
 
 def holding():
@@ -76,8 +78,8 @@ def judged():
     robot, spread_s = holding(), room_s(models)
     nodes, task = training_loop(robot, found.values, {}, {}, True, spread_s)
     env = GraphEnvironment(CompiledGraph(nodes, "agent", draw(nodes, 1.5)), task)
-    layer = (jnp.zeros((robot.agent.observation_size, 1)), jnp.full(1, VOLTS / 2.0))
-    zero, one = jnp.zeros(robot.agent.observation_size), jnp.ones(1)
+    layer = (jnp.zeros((observation_size(robot.task.observation), 1)), jnp.full(1, VOLTS / 2.0))
+    zero, one = jnp.zeros(observation_size(robot.task.observation)), jnp.ones(1)
     policy = Policy((layer,), one, zero, zero + 1.0, -2.0 * one, 2.0 * one, MLP((1,)))
     return sensitivity(env, policy, moves, fitted_to_graph(models, robot.model.tick_s, spread_s), seed=0)
 

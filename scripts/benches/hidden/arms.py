@@ -167,7 +167,7 @@ def record(path: Path, arm: HiddenArm, robot: Any, seconds: float) -> None:
     from sim2real.stages.session.excitation import excitation
 
     config = replace(robot.defaults.record, duration_s=seconds, seed=arm.seed)
-    signal = excitation(config, robot.rate_hz, len(robot.agent.action))
+    signal = excitation(config, robot.rate_hz, len(robot.task.action))
     goals = approached(signal + robot.drive.centre, robot.drive.servos.at_rest, robot.rate_hz)
     played = play(replace(arm, load_kg=0.0), robot, lambda reading, k: goals[k], len(goals) / RATE_HZ, 0)
     commands = [Goals(row.astype(np.float32)) for row in played.goals]
@@ -177,11 +177,12 @@ def record(path: Path, arm: HiddenArm, robot: Any, seconds: float) -> None:
 def agent(robot: Any, runner: Callable[[np.ndarray], np.ndarray], trial: int) -> Act:
     """Return a policy as the robot runs it: its node in numpy, with the aim of a trial."""
     from sim2real.graph.base import GraphState, StepState
+    from sim2real.robots.agent import AgentParams
     from sim2real.robots.loop import AGENT, SENSOR
     from sim2real.robots.nodes import in_numpy
 
-    node = robot.agent.make(robot.rate_hz)
-    params = in_numpy(robot.agent.params(robot.task.at_rest(trial), None))
+    node = robot.task.make_agent(robot.rate_hz)
+    params = in_numpy(AgentParams.of(robot.task.at_rest(trial)))
     state = in_numpy(node.init_state(None, GraphState(params={AGENT: params})))
 
     def act(reading: Any, k: int) -> np.ndarray:

@@ -13,7 +13,7 @@ from sim2real.arrays import namespace
 from sim2real.later import jax, jnp
 from sim2real.robots.messages import JointReading
 from sim2real.robots.servo.servos import Servos
-from sim2real.robots.servo.task import Aim, AimTask, Feature, ServoAgent, ServoMoment, uniform
+from sim2real.robots.servo.task import Aim, AimTask, Feature, ServoMoment, uniform
 from sim2real.types import Array, Key, Scalar
 
 FIGURE_HZ, FIGURE_M = 0.7, (0.05, 0.025)
@@ -50,8 +50,8 @@ def target_tasks(
     centres: tuple[tuple[float, ...], tuple[float, ...]],
     rate_hz: float = 50.0,
     still: tuple[int, ...] = (),
-) -> dict[str, tuple[ServoAgent, AimTask]]:
-    """Return agents and tasks: ``follow``, the tip on a figure of eight, and ``fast``, the tip soon at a target.
+) -> dict[str, AimTask]:
+    """Return the tasks ``follow``, the tip on a figure of eight, and ``fast``, the tip soon at a target.
 
     Args:
         servos: The servos, whose ``speed`` is the largest speed of the goals.
@@ -108,11 +108,8 @@ def target_tasks(
     moving = Aim((*_TARGET, *_AHEAD), figure, seen)
     resting = Aim(_TARGET, lambda key: tip_of(uniform(key, *targets)))
     return {
-        "follow": (
-            ServoAgent(servos, moving, (*features, ahead), observe),
-            AimTask(servos, moving, reward, success, tracked),
-        ),
-        "fast": (ServoAgent(servos, resting, features, observe), AimTask(servos, resting, reward, success, arrived)),
+        "follow": AimTask(servos, moving, reward, success, tracked, (*features, ahead), observe),
+        "fast": AimTask(servos, resting, reward, success, arrived, features, observe),
     }
 
 

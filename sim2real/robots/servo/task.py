@@ -1,4 +1,4 @@
-"""Task and policy of a robot of servos: aims, rewards, observation and actions."""
+"""The task of a robot of servos: aims, rewards, observation and actions."""
 
 from __future__ import annotations
 
@@ -14,12 +14,11 @@ from sim2real.graph.base import GraphState
 from sim2real.graph.node import NodeOptions
 from sim2real.later import jax, jnp
 from sim2real.policy.contract import ActionTerm, ObservationTerm
-from sim2real.robots.agent import AgentParams, GoalAgent
+from sim2real.robots.agent import GoalAgent
 from sim2real.robots.loop import AGENT, WORLD, Draw
 from sim2real.robots.messages import EpisodeStart, JointReading
-from sim2real.robots.robot import RobotAgent, RobotTask
+from sim2real.robots.robot import Judgement, RobotTask
 from sim2real.robots.servo.servos import Servos
-from sim2real.training.environment.tasks import Rewards
 from sim2real.types import Array, Key, PyTree, Scalar
 
 
@@ -68,13 +67,32 @@ class ServoMoment(NamedTuple):
     aim: Array
 
 
+Feature = tuple[str, tuple[str, ...]] | tuple[str, tuple[str, ...], float]
+"""Name and units of a term of the observation, and its largest magnitude [the units] where there is one."""
+Observe = Callable[[JointReading, Array, Array], Array]
+"""Returns the present part of the observation: (reading, goals ``(joints,)`` [rad], aim ``(k,)``) -> ``(features,)``.
+
+In training it gets arrays of JAX, on the robot of NumPy: ``namespace(goals)`` of ``sim2real.arrays`` is the matching
+module. ``jax.numpy`` works too, but is slower on the robot."""
+
+_MARGIN_RAD, _SPEED_FACTOR, _FASTEST_RAD_S = math.pi, 5.0, 1e3
+"""Bounds of measurements: distance from the goals' bounds; factor on the servo's speed without load; and the speed
+where the data sheet has no damping."""
+
+
 class AimTask(RobotTask):
-    """A task with random aims and starts: half of the episodes start at rest.
+    """A task of random aims and starts, half of them at rest.
+
+    The policy sees positions, velocities, goals, the aim and a short history, and sets the speeds of the goals.
 
     Args:
         reward: Returns the reward of a moment; a penalty on the goals' speed is added.
         success: Returns whether the task is fulfilled, bool.
         score: Returns figures of a deployment; see ``RobotTask.score``.
+        features: Names, units and largest magnitudes of the present part of the observation; None: positions,
+            velocities, goals and aim.
+        observe: Makes that part; see ``Observe``.
+        history: Past steps in the observation.
     """
 
     def __init__(
@@ -84,9 +102,23 @@ class AimTask(RobotTask):
         reward: Callable[[ServoMoment], jax.Array],
         success: Callable[[ServoMoment], jax.Array],
         score: Callable[[np.ndarray, Mapping[str, np.ndarray]], dict[str, float]],
+        features: tuple[Feature, ...] | None = None,
+        observe: Observe | None = None,
+        history: int = 3,
     ) -> None:
-        self._servos, self.aim = servos, aim
+        self._servos, self.aim, self._history, self._observe = servos, aim, history, observe or observe_all
         self._reward, self._success, self._score = reward, success, score
+        self.observation = servo_terms(servos, aim.entries, features, history)
+        speed, names = servos.speed, servos.names
+        self.action = tuple(ActionTerm(f"speed of {name}'s goal", "rad/s", -speed, speed) for name in names)
+        ends = {"lowest": servos.low, "highest": servos.high}
+        self.limits = {f"{end} goal of {n}": v for end, vs in ends.items() for n, v in zip(names, vs, strict=True)}
+        self.units = {f"aim[{i}]": unit for i, (_, unit) in enumerate(aim.entries)}
+
+    def make_agent(self, rate_hz: float, **options: Unpack[NodeOptions]) -> GoalAgent:
+        s, aim = self._servos, self.aim
+        ends = AGENT, rate_hz, s.low, s.high
+        return GoalAgent(*ends, self._observe, self._history, len(aim.draw(0)), aim.at, **options)
 
     def random(self, key: Key, draw: Draw) -> tuple[dict[str, PyTree], EpisodeStart]:
         k_values, k_aim, k_where, k_start = jax.random.split(key, 4)
@@ -106,69 +138,16 @@ class AimTask(RobotTask):
         position = jnp.clip(start.position + position, low, high)
         return start.replace(position=position, velocity=start.velocity + velocity)
 
-    def judged(self, graph_state: GraphState) -> ServoMoment:
+    def judge(self, graph_state: GraphState, action: jax.Array) -> Judgement:
         state, aim = graph_state.state[WORLD], jnp.asarray(graph_state.params[AGENT].aim)
         if self.aim.at is not None:
             aim = self.aim.at(aim, state.time_s)
-        return ServoMoment(state.position, state.velocity, aim)
-
-    def reward(self, state: ServoMoment, action: jax.Array) -> Rewards:
-        return {"task": self._reward(state), "speed": -0.01 * jnp.mean((action / self._servos.speed) ** 2)}
-
-    def success(self, state: ServoMoment) -> jax.Array:
-        return self._success(state)
+        now = ServoMoment(state.position, state.velocity, aim)
+        speed = -0.01 * jnp.mean((action / self._servos.speed) ** 2)
+        return Judgement({"task": self._reward(now), "speed": speed}, self._success(now))
 
     def score(self, t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float]:
         return self._score(t_s, states)
-
-
-Feature = tuple[str, tuple[str, ...]] | tuple[str, tuple[str, ...], float]
-"""Name and units of a term of the observation, and its largest magnitude [the units] where there is one."""
-Observe = Callable[[JointReading, Array, Array], Array]
-"""Returns the present part of the observation: (reading, goals ``(joints,)`` [rad], aim ``(k,)``) -> ``(features,)``.
-
-In training it gets arrays of JAX, on the robot of NumPy: ``namespace(goals)`` of ``sim2real.arrays`` is the matching
-module. ``jax.numpy`` works too, but is slower on the robot."""
-
-_MARGIN_RAD, _SPEED_FACTOR, _FASTEST_RAD_S = math.pi, 5.0, 1e3
-"""Bounds of measurements: distance from the goals' bounds; factor on the servo's speed without load; and the speed
-where the data sheet has no damping."""
-
-
-class ServoAgent(RobotAgent):
-    """Speeds of the goals from positions, velocities, goals, the aim and a short history.
-
-    Args:
-        features: Names, units and largest magnitudes of the present part of the observation; None: positions,
-            velocities, goals and aim.
-        observe: Makes that part; see ``Observe``.
-    """
-
-    def __init__(
-        self,
-        servos: Servos,
-        aim: Aim = NO_AIM,
-        features: tuple[Feature, ...] | None = None,
-        observe: Observe | None = None,
-        history: int = 3,
-    ) -> None:
-        self._servos, self._aim, self.history = servos, aim, history
-        self.observe = observe or observe_all
-        self.observation = servo_terms(servos, aim.entries, features, history)
-        speed, names = servos.speed, servos.names
-        self.action = tuple(ActionTerm(f"speed of {name}'s goal", "rad/s", -speed, speed) for name in names)
-        ends = {"lowest": servos.low, "highest": servos.high}
-        self.limits = {f"{end} goal of {n}": v for end, vs in ends.items() for n, v in zip(names, vs, strict=True)}
-        self.units = {f"aim[{i}]": unit for i, (_, unit) in enumerate(aim.entries)}
-
-    def make(self, rate_hz: float, **options: Unpack[NodeOptions]) -> GoalAgent:
-        s, aim = self._servos, self._aim
-        return GoalAgent(AGENT, rate_hz, s.low, s.high, self.observe, self.history, len(aim.draw(0)), aim.at, **options)
-
-    def params(self, start: EpisodeStart, policy: PyTree) -> AgentParams:
-        return AgentParams(
-            policy=policy, aim=start.aim, start=namespace(start.position).asarray(start.position, np.float32)
-        )
 
 
 def observe_all(reading: JointReading, goal: Array, aim: Array) -> Array:

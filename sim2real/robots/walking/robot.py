@@ -18,7 +18,7 @@ from sim2real.robots.robot import Robot
 from sim2real.robots.walking.body import Terrain
 from sim2real.robots.walking.drive import BodySensor, LegMotors, WalkingDrive
 from sim2real.robots.walking.stand import LegsInAStand
-from sim2real.robots.walking.task import Commands, Moment, Term, WalkingAgent, WalkingTask
+from sim2real.robots.walking.task import Commands, Moment, Term, WalkingTask
 from sim2real.robots.walking.world import STRENGTH, Ground, JointParameters, WalkingModel
 
 
@@ -65,10 +65,10 @@ class ComposedRobot(Robot):
         stance = np.asarray(self.stance, np.float32)
         self.sensor = BodySensor(self.joints, stance, self.noise)
         self.drive = WalkingDrive(self.mjcf, self.joints, self.stance, self.policy_hz, self.gains, self.motors)
-        self.agent = WalkingAgent(self.joints, stance, self.scale, self.history, self.commands)
         joints = JointParameters(self.joints, self.groups or {"joint": range(len(self.joints))})
         self.model: WalkingModel = WalkingModel(self.make_task, joints, self.height_m, self.terrain)
-        self.task = WalkingTask(self.commands, stance, 1.0 / self.rate_hz, self.terms(), self.falls)
+        policy = self.commands, self.joints, stance, self.scale, self.history
+        self.task = WalkingTask(*policy, 1.0 / self.rate_hz, self.terms(), self.falls)
 
     @abstractmethod
     def terms(self) -> Mapping[str, Term]:

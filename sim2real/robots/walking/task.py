@@ -19,9 +19,9 @@ from sim2real.policy.contract import ActionTerm, ObservationTerm
 from sim2real.robots.agent import AgentParams, PolicyAgent
 from sim2real.robots.loop import AGENT, WORLD, Draw
 from sim2real.robots.messages import EpisodeStart
-from sim2real.robots.robot import RobotAgent, RobotTask
+from sim2real.robots.robot import GRAVITY, Judgement, RobotTask
 from sim2real.robots.walking.drive import BodyReading, WalkDecision, gravity_of, into_base
-from sim2real.types import Array, Key, PyTree, Scalar
+from sim2real.types import Array, Key, Scalar
 
 
 @dataclass(frozen=True)
@@ -152,97 +152,6 @@ Term = tuple[float, Callable[[Moment], jax.Array | float]]
 """A weight, and a measure of a moment."""
 
 
-class WalkingTask(RobotTask):
-    """Follow velocities, without a fall.
-
-    Args:
-        terms: Name -> weight and measure, whose product is a term of the reward.
-        falls: Returns whether a robot has fallen, from height and gravity of a moment.
-        close: Largest error of the mean velocity that counts as success [m/s, rad/s].
-    """
-
-    def __init__(
-        self,
-        commands: Commands,
-        stance: np.ndarray,
-        period_s: float,
-        terms: Mapping[str, Term],
-        falls: Callable[[Moment], jax.Array],
-        close: float = 0.2,
-    ) -> None:
-        self._commands, self._stance, self._period_s = commands, np.asarray(stance, np.float32), period_s
-        self._terms, self._falls, self._close = terms, falls, close
-
-    def random(self, key: Key, draw: Draw) -> tuple[dict, EpisodeStart]:
-        k_values, k_commands = jax.random.split(key)
-        stance = jnp.asarray(self._stance)
-        return draw(k_values), EpisodeStart(stance, jnp.zeros_like(stance), self._commands.draw(k_commands))
-
-    def at_rest(self, trial: int) -> EpisodeStart:
-        return EpisodeStart(self._stance, np.zeros_like(self._stance), self._commands.of_trial(trial))
-
-    def moved(self, start: EpisodeStart, position: Array, velocity: Array, share: Scalar = 1.0) -> EpisodeStart:
-        return super().moved(start, position, velocity).replace(aim=share * start.aim)
-
-    def judged(self, graph_state: GraphState) -> Moment:
-        world, agent = graph_state.state[WORLD], graph_state.state[AGENT]
-        data, v = world.data, world.variables
-        t_s = (graph_state.step - 1) * self._period_s
-        turn, feet = data.qpos[3:7], v["at_m"]
-        moment = Moment(
-            command=jnp.asarray(self._commands.at(graph_state.params[AGENT].aim, t_s)),
-            linear=jnp.asarray(into_base(turn, data.qvel[:3])),
-            angular=data.qvel[3:6],
-            gravity=jnp.asarray(gravity_of(turn)),
-            mean=v["mean"],
-            height=data.qpos[2] - jnp.min(feet[:, 2]),
-            offset=data.qpos[7:] - self._stance,
-            torque=data.actuator_force,
-            last=agent.last,
-            before=agent.before,
-            touches=v["air_s"] == 0.0,
-            lands=(v["ground_s"] > 0.0) & (v["ground_s"] < self._period_s + 1e-4) & (v["swing_s"] > 0.0),
-            swing_s=v["swing_s"],
-            slip_m_s=v["slip_m_s"],
-            falls=jnp.bool_(False),
-        )
-        return moment._replace(falls=self._falls(moment))
-
-    def reward(self, state: Moment, action: jax.Array) -> dict[str, jax.Array]:
-        del action
-        return {name: jnp.float32(weight * measure(state)) for name, (weight, measure) in self._terms.items()}
-
-    def success(self, state: Moment) -> jax.Array:
-        return jnp.all(jnp.abs(state.mean - state.command) < self._close)
-
-    def terminated(self, state: Moment) -> jax.Array:
-        return state.falls
-
-    def score(self, t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float]:
-        """Return how well a deployment went: share of the time upright, largest tilt, and errors of the velocity.
-
-        The errors are means over the time, of velocities that are averaged over a step of the gait. Encoders and IMU do
-        not measure the linear velocity: its error needs the true states of an emulated robot.
-        """
-        turn = np.stack([states[f"quaternion[{i}]"] for i in range(4)], axis=-1)
-        turn = turn / np.linalg.norm(turn, axis=-1, keepdims=True)
-        upright = 1.0 - 2.0 * (turn[:, 1] ** 2 + turn[:, 2] ** 2)
-        # The commands change at policy steps, the states have times of their own.
-        step = ((t_s - t_s[0]) / self._period_s + 1e-6).astype(int)
-        off = []
-        for name, aim in (("linear[0]", "aim[0]"), ("linear[1]", "aim[1]"), ("gyro[2]", "aim[2]")):
-            wanted = states[aim][np.minimum(step, len(states[aim]) - 1)]
-            window = max(1, round(_GAIT_S / max(float(np.median(np.diff(t_s))), 1e-3)))
-            gap = states.get(name, np.full(len(t_s), np.nan)) - wanted
-            off.append(np.convolve(gap, np.ones(window) / window, "valid"))
-        return {
-            "success": float((upright > 0.5).mean()),
-            "tilt_rad": float(np.arccos(np.clip(upright, -1.0, 1.0)).max()),
-            "velocity_error_m_s": float(np.hypot(off[0], off[1]).mean()),
-            "yaw_error_rad_s": float(np.abs(off[2]).mean()),
-        }
-
-
 class WalkingNode(PolicyAgent):
     """Sends joint targets around the stance.
 
@@ -293,20 +202,40 @@ class WalkingNode(PolicyAgent):
         return WalkDecision(namespace(start).asarray(start, np.float32), np.zeros(3, np.float32))
 
 
-class WalkingAgent(RobotAgent):
-    """Observation and action of a walking robot: gyro, gravity, joints, last actions, and the commanded velocity."""
+class WalkingTask(RobotTask):
+    """Follow velocities, without a fall.
+
+    The policy sees gyro, gravity, joints, last actions, and the commanded velocity.
+
+    Args:
+        scale: Change of a target by the action 1 [rad].
+        history: Earlier observations that the policy gets.
+        terms: Name -> weight and measure, whose product is a term of the reward.
+        falls: Returns whether a robot has fallen, from height and gravity of a moment.
+        close: Largest error of the mean velocity that counts as success [m/s, rad/s].
+    """
 
     units = MappingProxyType({"aim": "m/s, m/s, rad/s"})
 
     def __init__(
-        self, joints: Sequence[str], stance: np.ndarray, scale: float, history: int, commands: Commands
+        self,
+        commands: Commands,
+        joints: Sequence[str],
+        stance: np.ndarray,
+        scale: float,
+        history: int,
+        period_s: float,
+        terms: Mapping[str, Term],
+        falls: Callable[[Moment], jax.Array],
+        close: float = 0.2,
     ) -> None:
-        n = len(joints)
-        self._stance, self._scale, self._history, self._commands = stance, scale, history, commands
+        self._commands, self._stance, self._period_s = commands, np.asarray(stance, np.float32), period_s
+        self._terms, self._falls, self._close = terms, falls, close
+        self._scale, self._history, n = scale, history, len(joints)
         units = ("rad/s",) * 3 + ("1",) * 3 + ("rad",) * n + ("rad/s",) * n + ("1",) * n
         now = (
             ObservationTerm("gyro", units[:3]),
-            ObservationTerm("gravity in the base's axes", units[3:6]),
+            ObservationTerm(GRAVITY, units[3:6]),
             ObservationTerm("joint position less stance", units[6 : 6 + n]),
             ObservationTerm("joint velocity", units[6 + n : 6 + 2 * n]),
             ObservationTerm("last action", units[6 + 2 * n :]),
@@ -316,11 +245,71 @@ class WalkingAgent(RobotAgent):
         self.observation = (*now, *past)
         self.action = tuple(ActionTerm(name, "1", -1.0, 1.0) for name in joints)
 
-    def make(self, rate_hz: float, **options: Unpack[NodeOptions]) -> WalkingNode:
+    def make_agent(self, rate_hz: float, **options: Unpack[NodeOptions]) -> WalkingNode:
         return WalkingNode(rate_hz, self._stance, self._scale, self._history, self._commands, **options)
 
-    def params(self, start: EpisodeStart, policy: PyTree) -> AgentParams:
-        return AgentParams(policy, start.aim, np.asarray(self._stance, np.float32))
+    def random(self, key: Key, draw: Draw) -> tuple[dict, EpisodeStart]:
+        k_values, k_commands = jax.random.split(key)
+        stance = jnp.asarray(self._stance)
+        return draw(k_values), EpisodeStart(stance, jnp.zeros_like(stance), self._commands.draw(k_commands), stance)
 
-    def tilt_rad(self, observation: np.ndarray) -> float:
-        return float(np.arccos(np.clip(-observation[5], -1.0, 1.0)))
+    def at_rest(self, trial: int) -> EpisodeStart:
+        stance = self._stance
+        return EpisodeStart(stance, np.zeros_like(stance), self._commands.of_trial(trial), stance)
+
+    def moved(self, start: EpisodeStart, position: Array, velocity: Array, share: Scalar = 1.0) -> EpisodeStart:
+        return super().moved(start, position, velocity).replace(aim=share * start.aim)
+
+    def moment(self, graph_state: GraphState) -> Moment:
+        """Return what a reward sees."""
+        world, agent = graph_state.state[WORLD], graph_state.state[AGENT]
+        data, v = world.data, world.variables
+        t_s = (graph_state.step - 1) * self._period_s
+        turn, feet = data.qpos[3:7], v["at_m"]
+        moment = Moment(
+            command=jnp.asarray(self._commands.at(graph_state.params[AGENT].aim, t_s)),
+            linear=jnp.asarray(into_base(turn, data.qvel[:3])),
+            angular=data.qvel[3:6],
+            gravity=jnp.asarray(gravity_of(turn)),
+            mean=v["mean"],
+            height=data.qpos[2] - jnp.min(feet[:, 2]),
+            offset=data.qpos[7:] - self._stance,
+            torque=data.actuator_force,
+            last=agent.last,
+            before=agent.before,
+            touches=v["air_s"] == 0.0,
+            lands=(v["ground_s"] > 0.0) & (v["ground_s"] < self._period_s + 1e-4) & (v["swing_s"] > 0.0),
+            swing_s=v["swing_s"],
+            slip_m_s=v["slip_m_s"],
+            falls=jnp.bool_(False),
+        )
+        return moment._replace(falls=self._falls(moment))
+
+    def judge(self, graph_state: GraphState, action: jax.Array) -> Judgement:
+        now = self.moment(graph_state)
+        terms = {name: jnp.float32(weight * measure(now)) for name, (weight, measure) in self._terms.items()}
+        return Judgement(terms, jnp.all(jnp.abs(now.mean - now.command) < self._close), now.falls)
+
+    def score(self, t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float]:
+        """Return how well a deployment went: share of the time upright, largest tilt, and errors of the velocity.
+
+        The errors are means over the time, of velocities that are averaged over a step of the gait. Encoders and IMU do
+        not measure the linear velocity: its error needs the true states of an emulated robot.
+        """
+        turn = np.stack([states[f"quaternion[{i}]"] for i in range(4)], axis=-1)
+        turn = turn / np.linalg.norm(turn, axis=-1, keepdims=True)
+        upright = 1.0 - 2.0 * (turn[:, 1] ** 2 + turn[:, 2] ** 2)
+        # The commands change at policy steps, the states have times of their own.
+        step = ((t_s - t_s[0]) / self._period_s + 1e-6).astype(int)
+        off = []
+        for name, aim in (("linear[0]", "aim[0]"), ("linear[1]", "aim[1]"), ("gyro[2]", "aim[2]")):
+            wanted = states[aim][np.minimum(step, len(states[aim]) - 1)]
+            window = max(1, round(_GAIT_S / max(float(np.median(np.diff(t_s))), 1e-3)))
+            gap = states.get(name, np.full(len(t_s), np.nan)) - wanted
+            off.append(np.convolve(gap, np.ones(window) / window, "valid"))
+        return {
+            "success": float((upright > 0.5).mean()),
+            "tilt_rad": float(np.arccos(np.clip(upright, -1.0, 1.0)).max()),
+            "velocity_error_m_s": float(np.hypot(off[0], off[1]).mean()),
+            "yaw_error_rad_s": float(np.abs(off[2]).mean()),
+        }

@@ -146,7 +146,7 @@ def walk(
     """
     robot, period_s = twin.robot, 1.0 / twin.robot.rate_hz
     steps = round(seconds * robot.rate_hz)
-    node: Any = robot.agent.make(robot.rate_hz)
+    node: Any = robot.task.make_agent(robot.rate_hz)
     node.commanded = lambda step_state: np.asarray(command(step_state.seq * period_s), np.float32)
     params = in_numpy(node.init_params())
     state = in_numpy(node.init_state(None, GraphState(params={AGENT: params})))

@@ -20,7 +20,7 @@ from sim2real.policy.runner import BlendedRunner, Runner, UprightRunner
 from sim2real.robots.loop import ACTUATOR, SENSOR
 from sim2real.robots.nodes import deployment_nodes
 from sim2real.robots.probe import Probe, StepAnswers, Witness, measure_delay
-from sim2real.robots.robot import Robot, joint_columns
+from sim2real.robots.robot import Robot, joint_columns, tilt_of
 from sim2real.stages.deploy.config import DeployConfig
 from sim2real.stages.live import live_view, scene_of
 from sim2real.stages.session.episode import Bench, opened
@@ -45,8 +45,8 @@ def run_episodes(
         Sim2RealError: The cause that stopped the robot.
     """
     policy: Runner = BlendedRunner(bundle.runner(config.backend), config.blend_s)
-    if config.max_tilt_rad is not None and robot.agent.tilt_rad is not None:
-        policy = UprightRunner(policy, robot.agent.tilt_rad, config.max_tilt_rad)
+    if config.max_tilt_rad is not None and (tilt_rad := tilt_of(robot.task.observation)) is not None:
+        policy = UprightRunner(policy, tilt_rad, config.max_tilt_rad)
     folder = logs[0].parent
     scene = partial(scene_of, robot)
     with live_view(config.view, folder, robot.name, scene), opened(robot, config, folder / TRUTH) as bench:
@@ -166,7 +166,7 @@ def _write_probe(log: Path, robot: Robot, witness: Witness) -> None:
     changed = [i == 0 or not np.array_equal(goal, witness.sent[i - 1][2]) for i, (*_, goal) in enumerate(witness.sent)]
     sent = _apart([begin_ns for begin_ns, *_ in witness.sent], period_ns, changed)
     # Write them as steps of the sensor and the actuator.
-    outputs = {SENSOR: robot.sensor.at_rest, ACTUATOR: robot.drive.message(np.zeros(len(robot.agent.action)))}
+    outputs = {SENSOR: robot.sensor.at_rest, ACTUATOR: robot.drive.message(np.zeros(len(robot.task.action)))}
     graph = {n: {"rate_hz": robot.rate_hz, "delay_s": 0.0, "inputs": {}} for n in outputs}
     metadata = {"pipeline": robot.name, "dry_run": False, "graph": graph, "probe": True}
     joints, units = {SENSOR: joint_columns(robot.sensor.channels)}, dict.fromkeys(outputs, robot.units)

@@ -17,7 +17,7 @@ from sim2real.errors import Sim2RealError, UsageError
 from sim2real.hardware.device import Following
 from sim2real.installation import has_jax
 from sim2real.policy.contract import PolicyContract
-from sim2real.robots.robot import RecordedRobot, Robot, RobotAgent, in_world
+from sim2real.robots.robot import GRAVITY, RecordedRobot, Robot, RobotTask, in_world, tilt_of
 from sim2real.stages.deploy.config import DeployConfig
 from sim2real.stages.deploy.episodes import run_episodes
 from sim2real.stages.load import AnyRobot, defaults_of, moving, robot_of, shipped_policy
@@ -224,7 +224,7 @@ def require_fit(robot: Robot, bundle: Bundle, config: DeployConfig) -> None:
     Raises:
         Sim2RealError: Names the difference.
     """
-    contract, agent = bundle.contract, robot.agent
+    contract, task = bundle.contract, robot.task
     where = f"in {bundle.path}" if bundle.path else "that was trained"
     if contract.robot and robot.folder is not None and contract.robot != robot.name:
         raise Sim2RealError(
@@ -232,32 +232,35 @@ def require_fit(robot: Robot, bundle: Bundle, config: DeployConfig) -> None:
         )
     if contract.port and (contract.port == _EMBEDDED) != (config.port == _EMBEDDED):
         _refuse_port(contract.port, config, where)
-    if config.max_tilt_rad is not None and agent.tilt_rad is None:
-        raise UsageError("this robot does not measure its tilt", hint="run without --max-tilt-rad, or set tilt_rad")
+    if config.max_tilt_rad is not None and tilt_of(task.observation) is None:
+        raise UsageError(
+            "this robot does not measure its tilt",
+            hint=f"run without --max-tilt-rad, or show {GRAVITY!r} to the policy",
+        )
 
-    def terms(of: PolicyContract | RobotAgent) -> dict[str, object]:
+    def terms(of: PolicyContract | RobotTask) -> dict[str, object]:
         seen = [(t.name, tuple(t.units), t.history) for t in of.observation]
         return {"sees": seen, "sends": [(t.name, t.unit) for t in of.action]}
 
     # A row for each difference: what the policy has, and what the robot has.
     rows: list[tuple[str, str]] = []
-    for (verb, trained), here in zip(terms(contract).items(), terms(agent).values(), strict=True):
+    for (verb, trained), here in zip(terms(contract).items(), terms(task).values(), strict=True):
         rows += [(f"{verb} {trained}", f"has {here}")] if trained != here else []
     if contract.rate_hz != robot.rate_hz:
         rows.append((f"runs at {contract.rate_hz:g} Hz", f"at {robot.rate_hz:g} Hz"))
-    for trained, term in zip(contract.observation, agent.observation, strict=False):
+    for trained, term in zip(contract.observation, task.observation, strict=False):
         bounds = [trained.low, trained.high], [term.low, term.high]
         if not rows and trained.low and term.low and not np.allclose(*bounds, rtol=1e-6):
             trains = f"was trained with {trained.name!r} from {trained.low} to {trained.high}"
             rows.append((trains, f"has {term.low} to {term.high}"))
-    for action, limit in zip(contract.action, agent.action, strict=False):
+    for action, limit in zip(contract.action, task.action, strict=False):
         # Training rounds the limits to float32.
         if action.low < np.float32(limit.low) or action.high > np.float32(limit.high):
             sends = f"sends {action.name!r} from {action.low:g} to {action.high:g} {action.unit}"
             rows.append((sends, f"allows {limit.low:g} to {limit.high:g}"))
     for name, value in contract.limits.items():
-        if name not in agent.limits or not np.isclose(value, agent.limits[name], rtol=1e-6):
-            rows.append((f"was trained with {name!r} = {value:g}", f"has {agent.limits.get(name, 'no such limit')}"))
+        if name not in task.limits or not np.isclose(value, task.limits[name], rtol=1e-6):
+            rows.append((f"was trained with {name!r} = {value:g}", f"has {task.limits.get(name, 'no such limit')}"))
     if rows:
         raise Sim2RealError(f"the policy {where} {rows[0][0]}, this robot {rows[0][1]}", hint=_TRAIN)
 

@@ -36,7 +36,7 @@ def played(config: RecordConfig, robot: Robot, announce: bool = False) -> np.nda
     Raises:
         UsageError: The robot cannot play it: the frequencies are too high, or a motion leaves its limits.
     """
-    commands = len(robot.agent.action)
+    commands = len(robot.task.action)
     if config.standing:
         if robot.drive.crouch is None:
             raise UsageError("this robot does not stand on legs", hint="choose another --excitation")

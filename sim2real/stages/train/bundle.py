@@ -101,15 +101,15 @@ def contract_of(
     for node, took_s in (episodes.drawn_s if episodes is not None else {}).items():
         trained[node] = (float(np.quantile(took_s, 0.01)), float(np.quantile(took_s, 0.99)))
     return PolicyContract(
-        observation=robot.agent.observation,
+        observation=robot.task.observation,
         action=tuple(
             replace(term, low=float(low), high=float(high))
-            for term, low, high in zip(robot.agent.action, task.action_low, task.action_high, strict=True)
+            for term, low, high in zip(robot.task.action, task.action_low, task.action_high, strict=True)
         ),
         rate_hz=robot.rate_hz,
         delays_s={n: v for n, v in values.items() if n.endswith("_delay")},
         trained_s=trained,
-        limits=dict(robot.agent.limits),
+        limits=dict(robot.task.limits),
         hashes={},
     )
 
@@ -124,7 +124,7 @@ def has_readings(robot: Robot, recording: Recording) -> bool:
 
 def _observations(robot: Robot, recording: Recording, runner: PolicyRunner) -> np.ndarray:
     """Return the observations ``(N, O)`` that a policy would get from a recording's measurements."""
-    agent: Any = robot.agent.make(robot.rate_hz)
+    agent: Any = robot.task.make_agent(robot.rate_hz)
     if not (hasattr(agent, "observe") and hasattr(agent, "act")):
         raise Sim2RealError(f"a {type(agent).__name__} has no `observe` and `act`, which a policy needs")
 

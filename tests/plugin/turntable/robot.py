@@ -13,10 +13,10 @@ from sim2real.graph.base import Base, GraphState
 from sim2real.identification.model import Channel
 from sim2real.identification.parameters import Parameter
 from sim2real.policy.contract import ActionTerm, ObservationTerm
-from sim2real.robots.agent import AgentParams, GoalAgent
+from sim2real.robots.agent import GoalAgent
 from sim2real.robots.loop import delay_of
 from sim2real.robots.messages import EpisodeStart, Goals, JointReading
-from sim2real.robots.robot import Embedded, Robot, RobotAgent, RobotDrive, RobotModel, RobotSensor, RobotTask
+from sim2real.robots.robot import Embedded, Judgement, Robot, RobotDrive, RobotModel, RobotSensor, RobotTask
 from sim2real.worlds.joint import Forces, JointState, JointWorld
 
 TICK_HZ = 100.0
@@ -104,23 +104,6 @@ class TableDrive(RobotDrive):
         rig.wait_until_still(settle_s)
 
 
-class TableAgent(RobotAgent):
-    """The policy changes the goal, up to 60 rad/s each second."""
-
-    observation = (ObservationTerm("velocity, goal, aim", ("rad/s",) * 3),)
-    action = (ActionTerm("change of the goal", "rad/s^2", -HARDEST, HARDEST),)
-    units = {"aim": "rad/s"}
-
-    def make(self, rate_hz, **options):
-        def features(reading, goal, aim):
-            return jnp.concatenate([reading.velocity, goal, aim])
-
-        return GoalAgent("agent", rate_hz, (-FASTEST,), (FASTEST,), features, history=0, aims=1, **options)
-
-    def params(self, start, policy):
-        return AgentParams(policy, start.aim, jnp.zeros(1))
-
-
 class TableModel(RobotModel):
     """The table in a speed loop: two parameters, each at a field of the world's parameters."""
 
@@ -142,24 +125,30 @@ class TableModel(RobotModel):
 
 
 class KeepSpeed(RobotTask):
-    """Turn at the speed of the episode, its aim [rad/s]."""
+    """Turn at the speed of the episode, its aim [rad/s]. The policy changes the goal, up to 60 rad/s each second."""
+
+    observation = (ObservationTerm("velocity, goal, aim", ("rad/s",) * 3),)
+    action = (ActionTerm("change of the goal", "rad/s^2", -HARDEST, HARDEST),)
+    units = {"aim": "rad/s"}
+
+    def make_agent(self, rate_hz, **options):
+        def features(reading, goal, aim):
+            return jnp.concatenate([reading.velocity, goal, aim])
+
+        return GoalAgent("agent", rate_hz, (-FASTEST,), (FASTEST,), features, history=0, aims=1, **options)
 
     def random(self, key, draw):
         of_values, of_aim = jax.random.split(key)
         aim = jax.random.uniform(of_aim, (1,), minval=-8.0, maxval=8.0)
-        return draw(of_values), EpisodeStart(jnp.zeros(1), jnp.zeros(1), aim)
+        return draw(of_values), EpisodeStart(jnp.zeros(1), jnp.zeros(1), aim, jnp.zeros(1))
 
     def at_rest(self, trial):
-        return EpisodeStart(jnp.zeros(1), jnp.zeros(1), jnp.array([(4.0, -6.0, 8.0)[trial % 3]]))
+        return EpisodeStart(jnp.zeros(1), jnp.zeros(1), jnp.array([(4.0, -6.0, 8.0)[trial % 3]]), jnp.zeros(1))
 
-    def judged(self, graph_state):
-        return graph_state.state["world"].velocity - graph_state.params["agent"].aim
-
-    def reward(self, error, action):
-        return -jnp.abs(error).sum() - 1e-4 * jnp.abs(action).sum()
-
-    def success(self, error):
-        return jnp.all(jnp.abs(error) < 0.5)
+    def judge(self, graph_state, action):
+        error = graph_state.state["world"].velocity - graph_state.params["agent"].aim
+        reward = -jnp.abs(error).sum() - 1e-4 * jnp.abs(action).sum()
+        return Judgement(reward, jnp.all(jnp.abs(error) < 0.5))
 
     def score(self, t_s, states):
         error = np.abs(states["velocity"] - states["aim"][-1])[t_s >= t_s[-1] - 1.0]
@@ -172,7 +161,6 @@ class TurntableRobot(Robot):
     def __init__(self):
         self.sensor = TableSensor()
         self.drive = TableDrive()
-        self.agent = TableAgent()
         self.model = TableModel()
         self.task = KeepSpeed()
 
