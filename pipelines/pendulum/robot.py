@@ -17,7 +17,7 @@ from sim2real.policy.contract import ActionTerm, ObservationTerm
 from sim2real.robots.loop import Draw
 from sim2real.robots.messages import EpisodeStart
 from sim2real.robots.probe import Probe
-from sim2real.robots.robot import Embedded, Judgement, Robot, RobotDrive, RobotModel, RobotSensor, RobotTask
+from sim2real.robots.robot import Embedded, Judgement, Robot, RobotDrive, RobotModel, RobotTask
 from sim2real.types import Key, Scalar
 
 from .mjcf import HINGE, STEP_S, mjcf_of
@@ -46,27 +46,21 @@ def upright(th: Any, thdot: Any) -> Any:
     return (xp.cos(th) > 0.95) & (xp.abs(thdot) < 0.5)
 
 
-class HingeSensor(RobotSensor):
-    """The servo's encoder."""
-
-    channels = (Channel("th", "thdot", position_sigma=0.002, velocity_sigma=0.05, label=HINGE),)
-    units = {"th": "rad", "thdot": "rad/s"}
-    at_rest = Measurement(th=np.float64(np.pi), thdot=np.float64(0.0))
-
-    def read(self, reading: Reading) -> Measurement:
-        return Measurement(reading.position_rad[0], reading.velocity_rad_s[0])
-
-
 class HingeDrive(RobotDrive):
-    """The servo in PWM mode, commanded in volts."""
+    """The servo's encoder, and its PWM mode, commanded in volts."""
 
     rate_hz = 50.0
+    channels = (Channel("th", "thdot", position_sigma=0.002, velocity_sigma=0.05, label=HINGE),)
+    at_rest = Measurement(th=np.float64(np.pi), thdot=np.float64(0.0))
     command, message = "action", Command
-    units = {"action": "V", "voltage": "V", "command": "V"}
+    units = {"th": "rad", "thdot": "rad/s", "action": "V", "voltage": "V", "command": "V"}
     probe = Probe(step=1.5, lag_s=(0.0, 0.0015))
 
     def __init__(self, mounting: tuple[Joint, ...] = ()) -> None:
         self._mounting = mounting
+
+    def read(self, reading: Reading) -> Measurement:
+        return Measurement(reading.position_rad[0], reading.velocity_rad_s[0])
 
     @property
     def mounting(self) -> tuple[Joint, ...]:
@@ -235,7 +229,6 @@ class PendulumRobot(Robot):
     """An eccentric mass on a servo that is driven by voltage."""
 
     def __init__(self, mounting: tuple[Joint, ...] = ()) -> None:
-        self.sensor = HingeSensor()
         self.drive = HingeDrive(mounting)
         self.model = HingeModel()
         self.task = SwingUp()

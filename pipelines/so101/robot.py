@@ -20,7 +20,7 @@ from sim2real.robots.messages import JointReading
 from sim2real.robots.probe import Probe
 from sim2real.robots.robot import Embedded, Robot
 from sim2real.robots.servo.model import Hand, ServoModel, friction_causes, goal_offsets, servo_parameters
-from sim2real.robots.servo.servos import JointSensor, ServoDrive, Servos, StsSheet
+from sim2real.robots.servo.servos import ServoDrive, Servos, StsSheet
 from sim2real.robots.servo.targets import target_tasks
 from sim2real.robots.servo.task import Aim, AimTask, ServoMoment, uniform
 from sim2real.types import Array, Key
@@ -98,7 +98,6 @@ class SO101Robot(Robot):
     def __init__(self, servos: Servos = SERVOS, calibration: Path | None = None) -> None:
         settings = partial(calibrated, calibration=calibration)
         probe = Probe(step=0.12, lag_s=(-0.009, -0.004))
-        self.sensor = JointSensor(servos)
         self.drive = ServoDrive(servos, probe=probe, embedded=embedded, settings=settings)
         more: dict[str, Any] = {"dynamics": dynamics, "causes": friction_causes(JOINTS)}
         self.model = ServoModel(servos, MJCF, HAND, step_s=STEP_S, **more)

@@ -419,5 +419,5 @@ def _on_hardware(robot: Robot, rig: Rig, agent: BaseNode, begin: Callable[[], No
 
 
 def _sensor(robot: Robot, rig: Rig) -> ServoSensor:
-    sensor, drive = robot.sensor, robot.drive
-    return ServoSensor(SENSOR, drive.rate_hz, rig, sensor.read, sensor.at_rest, delay=drive.expected_delay_s[0])
+    drive = robot.drive
+    return ServoSensor(SENSOR, drive.rate_hz, rig, drive.read, drive.at_rest, delay=drive.expected_delay_s[0])

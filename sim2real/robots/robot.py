@@ -1,7 +1,7 @@
 """A robot for the stages, on one page: ``ROBOT = MyRobot()`` in ``pipelines/NAME/robot.py``.
 
-A robot that was only recorded is a ``RecordedRobot``: what identification needs. A ``Robot`` has four parts besides: a
-sensor, a drive, a task and a model, and connects them to graphs. Each part inherits its class here; Python
+A robot that was only recorded is a ``RecordedRobot``: what identification needs. A ``Robot`` has three parts besides: a
+drive, a model and a task. Each part inherits its class here; Python
 refuses one without the methods that have no default.
 """
 
@@ -77,34 +77,17 @@ class Embedded:
         return replace(self.emulator, seed=seed).robot(plant, truth_path)
 
 
-class RobotSensor(ABC):
-    """The measured quantities.
-
-    Attributes:
-        channels: The measured quantities of each joint, in the order of the motors.
-        units: Field of the message -> its unit.
-        at_rest: The message of a robot at rest.
-        noise: Noise of the readings in training without an identification.
-    """
-
-    channels: tuple[Channel, ...]
-    units: Mapping[str, str]
-    at_rest: PyTree
-    noise: tuple[Noise, ...] = ()
-
-    @abstractmethod
-    def read(self, reading: Reading) -> PyTree:
-        """Return the message of a reading."""
-
-
 class RobotDrive(ABC):
-    """The commands to the motors, and the device on hardware, whose driver ``device`` imports.
+    """What is measured of the motors and sent to them, and the device on hardware, whose driver ``device`` imports.
 
     Attributes:
         rate_hz: Rate of sensor, agent and actuator [Hz].
+        channels: The measured quantities of each joint, in the order of the motors.
+        at_rest: The sensor's message of a robot at rest.
+        noise: Noise of the readings in training without an identification.
         command: Field of the actuator's message that is sent to the motors, one entry for each action.
-        units: Field of the message -> its unit.
         message: Makes the actuator's message from a command ``(actions,)``.
+        units: Field of either message -> its unit.
         expected_delay_s: Computation delays of sensor, agent and actuator that phases allow for: a bus transaction, and
             a policy with its thread's wake-up [s].
         centre: Commands around which an excitation moves, ``(actions,)``.
@@ -113,13 +96,20 @@ class RobotDrive(ABC):
     """
 
     rate_hz: float
+    channels: tuple[Channel, ...]
+    at_rest: PyTree
+    noise: tuple[Noise, ...] = ()
     command: str
-    units: Mapping[str, str]
     message: Callable[[PyTree], PyTree]
+    units: Mapping[str, str]
     expected_delay_s: tuple[float, float, float] = (0.002, 0.002, 0.002)
     centre: np.ndarray | float = 0.0
     crouch: np.ndarray | None = None
     probe: Probe | None = None
+
+    @abstractmethod
+    def read(self, reading: Reading) -> PyTree:
+        """Return the sensor's message of a reading."""
 
     @abstractmethod
     def device(self, port: str, silence_s: float, embedded: bool) -> Device:
@@ -354,14 +344,13 @@ class RecordedRobot(ABC):
 
 
 class Robot(RecordedRobot):
-    """A robot that can be recorded, trained for and deployed to. It has four parts, which its ``__init__`` sets.
+    """A robot that can be recorded, trained for and deployed to. It has three parts, which its ``__init__`` sets.
 
     Attributes:
         tasks: Further tasks by name; see ``with_task``.
     """
 
     drive: RobotDrive
-    sensor: RobotSensor
     task: RobotTask
     model: RobotModel
     tasks: Mapping[str, RobotTask] = _NOTHING
@@ -373,7 +362,7 @@ class Robot(RecordedRobot):
 
     @property
     def units(self) -> Mapping[str, str]:
-        return {**self.sensor.units, **self.drive.units, **self.task.units}
+        return {**self.drive.units, **self.task.units}
 
     @property
     def simulated(self) -> RobotModel:
@@ -402,7 +391,6 @@ class Robot(RecordedRobot):
 
 
 PARTS: Mapping[str, type] = {
-    "sensor": RobotSensor,
     "drive": RobotDrive,
     "task": RobotTask,
     "model": RobotModel,
@@ -420,7 +408,7 @@ def checked(robot: Any, where: str) -> RecordedRobot:
         raise UsageError(
             f"ROBOT of {where} is {'missing' if robot is None else repr(robot)}: a robot is an object of a class that "
             "inherits from sim2real.robots.robot.Robot, or from RecordedRobot where there are recordings only",
-            hint="write a class with the four parts of a Robot, and end with `ROBOT = MyRobot()`",
+            hint="write a class with the three parts of a Robot, and end with `ROBOT = MyRobot()`",
         )
     gaps: list[str] = []
     if isinstance(robot, Robot):

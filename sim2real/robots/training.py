@@ -98,11 +98,9 @@ def training_loop(
         {"delay": delay_s if delays else 0.0, "delay_dist": computation.get(name)}
         for name, delay_s in zip((SENSOR, AGENT, ACTUATOR), drive.expected_delay_s, strict=True)
     )
-    agent, sensor = (
-        robot.task.make_agent(drive.rate_hz, **on_agent),
-        SimSensor(SENSOR, drive.rate_hz, world, **on_sensor),
-    )
-    sensor.noise = robot.sensor.noise
+    agent = robot.task.make_agent(drive.rate_hz, **on_agent)
+    sensor = SimSensor(SENSOR, drive.rate_hz, world, **on_sensor)
+    sensor.noise = robot.drive.noise
     nodes = simulated_loop(sensor, agent, _sim_actuator(robot, **on_actuator), world, bounds)
     return nodes, LoopTask(robot, agent, values, draws)
 
@@ -118,7 +116,7 @@ def simulation_params(
     values, start = split_delay(values, robot.model.tick_s), robot.task.at_rest(trial)
     if measured is not None:
         offset = measured - np.asarray(start.position)
-        angles = [robot.sensor.units.get(channel.position) == "rad" for channel in robot.sensor.channels]
+        angles = [robot.drive.units.get(channel.position) == "rad" for channel in robot.drive.channels]
         # Whole turns of a hinge without range are no offset.
         offset -= np.where(angles, 2 * np.pi * np.round(offset / (2 * np.pi)), 0.0)
         # Not `moved`, which keeps drawn starts within the bounds of goals: a robot may rest beyond them, on a stop.
@@ -169,7 +167,7 @@ class LoopTask(TrainingTask):
             offsets = self.offsets(key_start, width)
         values, start = task.random(key, draw)
         if offsets is not None or width is not None:
-            still = jnp.zeros(len(self.robot.sensor.channels))
+            still = jnp.zeros(len(self.robot.drive.channels))
             start = task.moved(start, *(offsets or (still, still)), 1.0 if width is None else width)
         params = node_parameters(self.robot, values, start)
         return params if width is None else {**params, SENSOR: params[SENSOR].replace(noise=width)}
@@ -181,7 +179,7 @@ class LoopTask(TrainingTask):
             width: Share of the differences; None: all of them.
         """
         share = 1.0 if width is None else width
-        drawn = share * jax.random.uniform(key, (2, len(self.robot.sensor.channels)), minval=-1.0, maxval=1.0)
+        drawn = share * jax.random.uniform(key, (2, len(self.robot.drive.channels)), minval=-1.0, maxval=1.0)
         return self.start[0] * drawn[0], self.start[1] * drawn[1]
 
     def observe(self, step_state: StepState) -> jax.Array:
@@ -242,7 +240,7 @@ class IdentifiableLoop:
     def __init__(self, robot: Robot, max_delay_s: float) -> None:
         self._robot = robot
         self.parameters = ParameterTable([*robot.model.dynamics(), *delay_parameters(max_delay_s)])
-        self.ahead_s, self.channels = robot.model.tick_s, robot.sensor.channels
+        self.ahead_s, self.channels = robot.model.tick_s, robot.drive.channels
         message = _sim_actuator(robot).init_output()
         fields = pytree.structure(message).unflatten(list(named_leaves(message)))
         self.given: Mapping[str, PyTree] = {ACTUATOR: fields}

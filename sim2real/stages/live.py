@@ -39,7 +39,7 @@ def scene_of(robot: RecordedRobot) -> dict[str, Json]:
     """Return what another process needs to draw a robot; empty if the robot has no model."""
     if not isinstance(robot, Robot):
         return {}
-    columns = {name: fields["position"] for name, fields in joint_columns(robot.sensor.channels).items()}
+    columns = {name: fields["position"] for name, fields in joint_columns(robot.drive.channels).items()}
     file = getattr(robot, "mjcf", None)  # of a walking robot, which has no model for others
     return {"mjcf": robot.model.identified_mjcf(robot.nominal()) or (str(file) if file else None), "columns": columns}
 

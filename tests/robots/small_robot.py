@@ -11,7 +11,7 @@ from sim2real.graph.base import GraphState, InputState, StepState
 from sim2real.robots.messages import EpisodeStart, Goals
 from sim2real.robots.robot import Robot
 from sim2real.robots.servo.model import ServoModel
-from sim2real.robots.servo.servos import DataSheet, JointSensor, ServoDrive, Servos
+from sim2real.robots.servo.servos import DataSheet, ServoDrive, Servos
 from sim2real.robots.servo.task import Aim, AimTask, uniform
 
 MJCF = Path(__file__).with_name("pair.xml")
@@ -25,7 +25,6 @@ class PairRobot(Robot):
     """Shows its policy the default features; its aim is one angle, which its model does not have."""
 
     def __init__(self, servos=SERVOS, aim=ANGLE, features=None, observe=None, history=2, converged=False):
-        self.sensor = JointSensor(servos)
         self.drive = ServoDrive(servos)
         self.model = (Converged if converged else ServoModel)(servos, MJCF, step_s=0.005)
         self.task = AimTask(servos, aim, reward, success, score, features, observe, history)

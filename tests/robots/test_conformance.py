@@ -35,7 +35,7 @@ def pendulum(part=None, **changes):
         (None, {"nominal": lambda _: {"gain": 1e9}}, "gain = 1000000000.0 is outside its bounds"),
         (None, {"nominal": lambda _: {"mass": 1.0}}, "parameters that can be identified: .* but not mass"),
         (
-            "sensor",
+            "drive",
             {"channels": (Channel("angle", None, 0.002, 0.05),)},
             "fields that the sensor measures: there are th, thdot, but not angle",
         ),

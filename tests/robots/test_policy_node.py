@@ -48,7 +48,7 @@ def steps_of(node, robot, policy):
     state = StepState(params=params, state=node.init_state(None, start), seq=np.int32(0))
     messages, none = [], np.zeros(1, np.float32)
     for k in range(STEPS):
-        reading = jax.tree_util.tree_map(lambda x, k=k: np.asarray(x, np.float32)[None] + 0.1 * k, robot.sensor.at_rest)
+        reading = jax.tree_util.tree_map(lambda x, k=k: np.asarray(x, np.float32)[None] + 0.1 * k, robot.drive.at_rest)
         seen = InputState(np.array([k], np.int32), none, none, reading)
         state, message = node.step(state.replace(inputs={SENSOR: seen}, seq=np.int32(k)))
         messages.append(message)

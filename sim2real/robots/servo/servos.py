@@ -17,7 +17,7 @@ from sim2real.robots.loop import ACTUATOR
 from sim2real.robots.messages import Goals, JointReading
 from sim2real.robots.nodes import HOME_RAD_S
 from sim2real.robots.probe import Probe
-from sim2real.robots.robot import Embedded, RobotDrive, RobotSensor
+from sim2real.robots.robot import Embedded, RobotDrive
 
 if TYPE_CHECKING:
     from sim2real.hardware.bus.registers import Family
@@ -150,31 +150,16 @@ class Servos:
 _AT_HOME_RAD, _AT_END_S = 0.1, 0.5
 
 
-class JointSensor(RobotSensor):
-    """Positions and velocities of all joints, of one reading."""
-
-    units = MappingProxyType({"position": "rad", "velocity": "rad/s"})
-
-    def __init__(self, servos: Servos) -> None:
-        names = servos.names
-        self.channels = tuple(
-            Channel("position", "velocity", 0.002, 0.05, i, name, goal="goal") for i, name in enumerate(names)
-        )
-        self.at_rest = JointReading(servos.at_rest, np.zeros(len(names)))
-
-    def read(self, reading: Reading) -> JointReading:
-        return JointReading(reading.position_rad, reading.velocity_rad_s)
-
-
 class ServoDrive(RobotDrive):
-    """Goals of all servos in one transaction.
+    """Positions and velocities of all joints in one transaction, and goals of all servos in another.
 
     Args:
         embedded: Returns the emulated robot; None: there is none.
         settings: Returns the device's settings, given whether it is the emulated one; default: the data sheet's.
     """
 
-    command, units, message = "goal", MappingProxyType({"goal": "rad"}), Goals
+    command, message = "goal", Goals
+    units = MappingProxyType({"position": "rad", "velocity": "rad/s", "goal": "rad"})
     expected_delay_s = (0.004, 0.003, 0.002)
 
     def __init__(
@@ -189,6 +174,13 @@ class ServoDrive(RobotDrive):
         self.servos, self.rate_hz, self.probe = servos, rate_hz, probe
         self._embedded, self._settings = embedded, settings
         self.centre = np.asarray(servos.middle or 0.0)
+        self.channels = tuple(
+            Channel("position", "velocity", 0.002, 0.05, i, name, goal="goal") for i, name in enumerate(servos.names)
+        )
+        self.at_rest = JointReading(servos.at_rest, np.zeros(len(servos.names)))
+
+    def read(self, reading: Reading) -> JointReading:
+        return JointReading(reading.position_rad, reading.velocity_rad_s)
 
     @property
     def mounting(self) -> tuple[Joint, ...]:

@@ -1,4 +1,4 @@
-"""Messages, sensor and drive of a walking robot."""
+"""Messages and drive of a walking robot."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sim2real.artifacts.identification import Noise
 from sim2real.errors import SafetyStop, UsageError
 from sim2real.graph.base import Base
 from sim2real.identification.model import Channel
-from sim2real.robots.robot import Embedded, RobotDrive, RobotSensor
+from sim2real.robots.robot import Embedded, RobotDrive
 from sim2real.types import Array
 
 if TYPE_CHECKING:
@@ -152,45 +152,22 @@ class StandUp:
         return start + fold * (folded - start) + rise * (stance - folded)
 
 
-class BodySensor(RobotSensor):
-    """Encoders, and the IMU: its orientation and gyro.
-
-    Args:
-        noise: Field of the reading -> deviation and bias of the noise without an identification, in the field's unit.
-    """
-
-    units = MappingProxyType({"position": "rad", "velocity": "rad/s", "quaternion": "1", "gyro": "rad/s"})
-
-    def __init__(
-        self, joints: Sequence[str], stance: np.ndarray, noise: Mapping[str, tuple[float, float]] = MappingProxyType({})
-    ) -> None:
-        self.channels = tuple(
-            Channel("position", "velocity", 5e-4, 0.03, index=i, label=name, goal="q") for i, name in enumerate(joints)
-        )
-        self.at_rest = BodyReading(stance, np.zeros_like(stance), np.array([1.0, 0, 0, 0]), np.zeros(3))
-        self.noise = tuple(
-            Noise(f"{field}[{i}]", self.units[field], deviation, 0.0, bias)
-            for field, (deviation, bias) in noise.items()
-            for i in range(len(np.ravel(getattr(self.at_rest, field))))
-        )
-
-    def read(self, reading: Reading) -> BodyReading:
-        parts = reading.parts
-        return BodyReading(reading.position_rad, reading.velocity_rad_s, parts["quaternion"], parts["gyro"])
-
-
 class WalkingDrive(RobotDrive):
-    """Targets of all joints, with the same gains for all motors.
+    """Encoders and the IMU's orientation and gyro; targets of all joints, with the same gains for all motors.
 
     Args:
         mjcf: The model, whose ranges of the joints are those of the targets.
         gains: kp [N m/rad] and kd [N m s/rad] while the policy runs.
         motors: The motors; None: the robot has no device, and its policy walks on the twin alone.
+        noise: Field of the reading -> deviation and bias of the noise without an identification, in the field's unit.
     """
 
     centre: np.ndarray
     command = "q"
-    units = MappingProxyType({"q": "rad", "dq": "rad/s", "kp": "N m/rad", "kd": "N m s/rad", "tau": "N m"})
+    units = MappingProxyType(
+        {"position": "rad", "velocity": "rad/s", "quaternion": "1", "gyro": "rad/s"}
+        | {"q": "rad", "dq": "rad/s", "kp": "N m/rad", "kd": "N m s/rad", "tau": "N m"}
+    )
     expected_delay_s = (0.002, 0.003, 0.002)
 
     def __init__(
@@ -201,11 +178,26 @@ class WalkingDrive(RobotDrive):
         rate_hz: float,
         gains: tuple[float, float],
         motors: LegMotors | None = None,
+        noise: Mapping[str, tuple[float, float]] = MappingProxyType({}),
     ) -> None:
         self._mjcf, self._joints, self.centre, self.rate_hz = mjcf, tuple(joints), np.asarray(stance), rate_hz
         self._motors = motors
         self.crouch = _BENT * (np.asarray(motors.folded) - self.centre) if motors else np.zeros_like(self.centre)
         self.message: Callable[[Any], LegCommand] = partial(leg_command, kp=gains[0], kd=gains[1])
+        self.channels = tuple(
+            Channel("position", "velocity", 5e-4, 0.03, index=i, label=name, goal="q") for i, name in enumerate(joints)
+        )
+        lying = np.asarray(stance, np.float32)
+        self.at_rest = BodyReading(lying, np.zeros_like(lying), np.array([1.0, 0, 0, 0]), np.zeros(3))
+        self.noise = tuple(
+            Noise(f"{field}[{i}]", self.units[field], deviation, 0.0, bias)
+            for field, (deviation, bias) in noise.items()
+            for i in range(len(np.ravel(getattr(self.at_rest, field))))
+        )
+
+    def read(self, reading: Reading) -> BodyReading:
+        parts = reading.parts
+        return BodyReading(reading.position_rad, reading.velocity_rad_s, parts["quaternion"], parts["gyro"])
 
     def embedded(self, hanging: bool = False) -> Embedded | None:
         motors = self._motors

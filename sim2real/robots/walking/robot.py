@@ -16,7 +16,7 @@ import numpy as np
 from sim2real.robots.loop import DELAYS
 from sim2real.robots.robot import Robot
 from sim2real.robots.walking.body import Terrain
-from sim2real.robots.walking.drive import BodySensor, LegMotors, WalkingDrive
+from sim2real.robots.walking.drive import LegMotors, WalkingDrive
 from sim2real.robots.walking.stand import LegsInAStand
 from sim2real.robots.walking.task import Commands, Moment, Term, WalkingTask
 from sim2real.robots.walking.world import STRENGTH, Ground, JointParameters, WalkingModel
@@ -63,8 +63,8 @@ class ComposedRobot(Robot):
 
     def __init__(self) -> None:
         stance = np.asarray(self.stance, np.float32)
-        self.sensor = BodySensor(self.joints, stance, self.noise)
-        self.drive = WalkingDrive(self.mjcf, self.joints, self.stance, self.policy_hz, self.gains, self.motors)
+        motors = self.policy_hz, self.gains, self.motors, self.noise
+        self.drive = WalkingDrive(self.mjcf, self.joints, self.stance, *motors)
         joints = JointParameters(self.joints, self.groups or {"joint": range(len(self.joints))})
         self.model: WalkingModel = WalkingModel(self.make_task, joints, self.height_m, self.terrain)
         policy = self.commands, self.joints, stance, self.scale, self.history
@@ -96,5 +96,5 @@ class ComposedRobot(Robot):
     def identifiable(self, max_delay_s: float) -> LegsInAStand:
         # The strengths of the motors take the place of a factor on all of them.
         fixed = [replace(p, free=False) for p in self.model.around() if p.name == STRENGTH]
-        loop = self.sensor.channels, self.rate_hz, self.gains[1]
+        loop = self.drive.channels, self.rate_hz, self.gains[1]
         return LegsInAStand(self.mjcf, self.model.joints, fixed, *loop, max_delay_s)

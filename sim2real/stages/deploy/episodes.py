@@ -166,13 +166,13 @@ def _write_probe(log: Path, robot: Robot, witness: Witness) -> None:
     changed = [i == 0 or not np.array_equal(goal, witness.sent[i - 1][2]) for i, (*_, goal) in enumerate(witness.sent)]
     sent = _apart([begin_ns for begin_ns, *_ in witness.sent], period_ns, changed)
     # Write them as steps of the sensor and the actuator.
-    outputs = {SENSOR: robot.sensor.at_rest, ACTUATOR: robot.drive.message(np.zeros(len(robot.task.action)))}
+    outputs = {SENSOR: robot.drive.at_rest, ACTUATOR: robot.drive.message(np.zeros(len(robot.task.action)))}
     graph = {n: {"rate_hz": robot.rate_hz, "delay_s": 0.0, "inputs": {}} for n in outputs}
     metadata = {"pipeline": robot.name, "dry_run": False, "graph": graph, "probe": True}
-    joints, units = {SENSOR: joint_columns(robot.sensor.channels)}, dict.fromkeys(outputs, robot.units)
+    joints, units = {SENSOR: joint_columns(robot.drive.channels)}, dict.fromkeys(outputs, robot.units)
     recorder = McapRecorder(log, metadata, {}, outputs, [], joints, units)
     recorder.start(0, start_ns)
-    read, message = robot.sensor.read, robot.drive.message
+    read, message = robot.drive.read, robot.drive.message
     rows = [(SENSOR, k, *witness.measured[i][:2], read(witness.measured[i][2])) for k, i in enumerate(measured)]
     rows += [(ACTUATOR, k, *witness.sent[i][:2], message(witness.sent[i][2])) for k, i in enumerate(sent)]
     for node, seq, *times_ns, output in rows:

@@ -122,7 +122,7 @@ def _simulated(
 def _rest(robot: Robot, episode: Episode) -> np.ndarray:
     """Return the first measured position of each channel ``(channels,)``."""
     fields = dict(named_leaves(episode.outputs[SENSOR]))
-    return np.array([float(c.of(np.asarray(fields[c.position])).ravel()[0]) for c in robot.sensor.channels])
+    return np.array([float(c.of(np.asarray(fields[c.position])).ravel()[0]) for c in robot.drive.channels])
 
 
 def plausible_parameters(identification: Identification, episodes: int) -> list[dict[str, float]]:

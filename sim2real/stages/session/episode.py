@@ -183,7 +183,7 @@ class Bench:
         }
         inputs = [(n, i) for n, node in graph.nodes.items() for i in node.inputs]
         joints, units = (
-            {SENSOR: joint_columns(self.robot.sensor.channels)},
+            {SENSOR: joint_columns(self.robot.drive.channels)},
             dict.fromkeys(graph.nodes, self.robot.units),
         )
         return McapRecorder(log, metadata, {}, state.aux["outputs"], inputs, joints, units)

@@ -105,7 +105,7 @@ def _of_log(path: Path, robot: Robot) -> tuple[np.ndarray, np.ndarray, str]:
     sent = episode.outputs.get(ACTUATOR, {}).get(field)
     if sent is not None and len(sent):
         return episode.steps[ACTUATOR].end / TICKS_PER_S, sent, f"{field} of {path.name}"
-    position = next((c.position for c in robot.sensor.channels if c.goal == field), "")
+    position = next((c.position for c in robot.drive.channels if c.goal == field), "")
     measured = episode.outputs.get(SENSOR, {}).get(position)
     if measured is None:
         raise UsageError(

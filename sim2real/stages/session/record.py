@@ -113,7 +113,7 @@ def run(robot: RecordedRobot, config: RecordConfig, root: Path, run_dir: Path | 
 def _show_by_hand(recording: Recording, robot: Robot) -> None:
     """Print how far each joint was moved by hand, and the command that plays the motion."""
     outputs, rows = recording.episode.outputs[SENSOR], []
-    for channel in robot.sensor.channels:
+    for channel in robot.drive.channels:
         values = np.asarray(channel.of(outputs[channel.position]), np.float64)
         rows.append([channel.label or channel.position, values.min(), values.max(), np.ptp(values)])
     print(table(rows, ["joint", "lowest [rad]", "highest [rad]", "moved by [rad]"]))

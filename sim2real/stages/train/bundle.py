@@ -119,7 +119,7 @@ def contract_of(
 
 def has_readings(robot: Robot, recording: Recording) -> bool:
     """Return whether a log has all readings of a robot; one of another recorder may lack velocities."""
-    return set(named_leaves(robot.sensor.at_rest)) <= set(recording.episode.outputs.get(SENSOR, {}))
+    return set(named_leaves(robot.drive.at_rest)) <= set(recording.episode.outputs.get(SENSOR, {}))
 
 
 def _observations(robot: Robot, recording: Recording, runner: PolicyRunner) -> np.ndarray:
@@ -129,8 +129,8 @@ def _observations(robot: Robot, recording: Recording, runner: PolicyRunner) -> n
         raise Sim2RealError(f"a {type(agent).__name__} has no `observe` and `act`, which a policy needs")
 
     # Arrange the recorded readings as the leaves of a message.
-    leaves, form = jax.tree_util.tree_flatten(robot.sensor.at_rest)
-    columns = [recording.episode.outputs[SENSOR][name] for name in named_leaves(robot.sensor.at_rest)]
+    leaves, form = jax.tree_util.tree_flatten(robot.drive.at_rest)
+    columns = [recording.episode.outputs[SENSOR][name] for name in named_leaves(robot.drive.at_rest)]
     columns = [c.astype(np.float32).reshape(-1, *np.shape(leaf)) for c, leaf in zip(columns, leaves, strict=True)]
 
     # Play the agent over them.

@@ -16,7 +16,7 @@ from sim2real.policy.contract import ActionTerm, ObservationTerm
 from sim2real.robots.agent import GoalAgent
 from sim2real.robots.loop import delay_of
 from sim2real.robots.messages import EpisodeStart, Goals, JointReading
-from sim2real.robots.robot import Embedded, Judgement, Robot, RobotDrive, RobotModel, RobotSensor, RobotTask
+from sim2real.robots.robot import Embedded, Judgement, Robot, RobotDrive, RobotModel, RobotTask
 from sim2real.worlds.joint import Forces, JointState, JointWorld
 
 TICK_HZ = 100.0
@@ -67,21 +67,16 @@ class Table(JointWorld):
         return Forces(acceleration=params.loop * command, damping=params.loop, dry=params.friction)
 
 
-class TableSensor(RobotSensor):
-    """Angle and speed of the table."""
+class TableDrive(RobotDrive):
+    """The board, commanded by speeds. It imports its driver when it is opened: training does not need it."""
 
+    rate_hz, command, message = 50.0, "goal", Goals
     channels = (Channel("position", "velocity", 0.002, 0.05, index=0, label="table"),)
-    units = {"position": "rad", "velocity": "rad/s"}
+    units = {"position": "rad", "velocity": "rad/s", "goal": "rad/s"}
     at_rest = JointReading(np.zeros(1), np.zeros(1))
 
     def read(self, reading):
         return JointReading(reading.position_rad, reading.velocity_rad_s)
-
-
-class TableDrive(RobotDrive):
-    """The board, commanded by speeds. It imports its driver when it is opened: training does not need it."""
-
-    rate_hz, command, message, units = 50.0, "goal", Goals, {"goal": "rad/s"}
 
     def embedded(self, hanging=False):
         from .odrive_emulation import ODriveEmulation
@@ -159,7 +154,6 @@ class TurntableRobot(Robot):
     """A turntable whose motor controller keeps a speed."""
 
     def __init__(self):
-        self.sensor = TableSensor()
         self.drive = TableDrive()
         self.model = TableModel()
         self.task = KeepSpeed()
