@@ -35,7 +35,7 @@ def make_bundle(name, folder, bias=0.0, slope=0.0):
     kernel = np.zeros((size, len(low)))
     kernel[2] = slope
     trained = {"round_trip_delay": (0.043, 0.047)} if name == "pendulum" else {}
-    terms = robot.task.observation, robot.task.action, robot.rate_hz
+    terms = robot.task.observation, robot.task.action, robot.drive.rate_hz
     contract = PolicyContract(*terms, trained_s=trained, limits=dict(robot.task.limits))
     layers = {"layers.0.kernel": kernel, "layers.0.bias": np.full(len(low), bias)}
     return save_bundle(folder / "bundle", weights | layers, contract)

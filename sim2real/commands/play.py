@@ -125,8 +125,8 @@ def _write_picture(twin: "Twin", qpos: "np.ndarray", out: Path) -> None:
 
     figure = Figure(figsize=(4.8, 2.7), dpi=80, layout="constrained")
     axes = figure.subplots()
-    every = max(1, round(twin.robot.rate_hz / _FRAMES_PER_S))
-    writer = PillowWriter(fps=round(twin.robot.rate_hz / every))
+    every = max(1, round(twin.robot.drive.rate_hz / _FRAMES_PER_S))
+    writer = PillowWriter(fps=round(twin.robot.drive.rate_hz / every))
     with writer.saving(figure, str(out), 80):
         for row in qpos[::every]:
             axes.clear()

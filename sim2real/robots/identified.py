@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from sim2real import pytree
 from sim2real.graph.delays import TrainableDist
@@ -13,12 +14,15 @@ from sim2real.graph.node import BaseNode
 from sim2real.identification.model import Channel
 from sim2real.identification.parameters import Parameter, ParameterTable
 from sim2real.robots.loop import ACTUATOR, SENSOR, WORLD
-from sim2real.robots.robot import RecordedRobot, Simulated
+from sim2real.robots.robot import RecordedRobot
 from sim2real.types import PyTree, Scalar
 from sim2real.worlds.recorded import RecordedActuator
 
+if TYPE_CHECKING:
+    from sim2real.log.importing.mapping import ImportMapping
 
-class LoggedRobot(RecordedRobot, Simulated):
+
+class LoggedRobot(RecordedRobot):
     """A ``RecordedRobot`` without a device; subclasses define its nodes and parameters.
 
     Attributes:
@@ -27,16 +31,14 @@ class LoggedRobot(RecordedRobot, Simulated):
         tick_s: The world's period, where samples fall between its ticks: the sensor then needs a tick of delay to
             interpolate. 0 where samples fall on ticks.
         burst: Extra commands in a delay's window, for commands that came faster than their rate.
+        mapping: Mapping of its logs of other recorders, if it has no folder; a folder has an ``import.toml``.
     """
 
     channels: tuple[Channel, ...]
     delayed: str = "command to measurement"
     tick_s: float = 0.0
     burst: int = 0
-
-    @property
-    def simulated(self) -> Simulated:
-        return self
+    mapping: ImportMapping | None = None
 
     @abstractmethod
     def dynamics(self) -> list[Parameter]:
@@ -53,6 +55,18 @@ class LoggedRobot(RecordedRobot, Simulated):
             start: Shape ``(2 * channels,)``: measured positions, then velocities.
         """
         return {**params, WORLD: params[WORLD].replace(start=start)}
+
+    def with_optional_terms(self, wanted: str) -> LoggedRobot:
+        """Return the robot with further optional terms; default: the robot, which has all of them.
+
+        Args:
+            wanted: ``auto``, ``all``, or names separated by commas.
+        """
+        return self
+
+    def doubts(self, outputs: Mapping[str, PyTree]) -> list[str]:
+        """Return sentences on positions of a log that the model cannot have; default: none."""
+        return []
 
     def identifiable(self, max_delay_s: float) -> IdentifiableRecording:
         return IdentifiableRecording(self, max_delay_s)

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeVar, Unpack
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, Unpack
 
 import numpy as np
 
@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from sim2real.hardware.safety.gate import GateConfig, GateLimits
     from sim2real.hardware.safety.rig import Rig
     from sim2real.identification.export.targets import Late
-    from sim2real.log.importing.mapping import ImportMapping
     from sim2real.stages.config import Defaults
 
 AnyRobot = TypeVar("AnyRobot", bound="RecordedRobot")
@@ -228,46 +227,34 @@ class RobotTask(ABC):
         """
 
 
-class Simulated:
-    """What exports and the drift test ask of a robot's model.
+@dataclass(frozen=True)
+class Exported:
+    """A robot's model with identified values, for other simulators.
 
     Attributes:
-        causes: Causes that change several parameters at once: name -> parameter -> change of the parameter on its scale
-            when the cause grows by a factor of e.
-        watched_terms: Optional terms that may change between deployments, such as a payload.
+        mjcf: The model as MJCF.
+        late: The timing in C MuJoCo that this text does not hold.
+        plain: Returns the model as a simulation in plain MuJoCo.
     """
 
-    causes: Mapping[str, Mapping[str, float]] = _NOTHING
-    watched_terms: tuple[str, ...] = ()
-
-    def identified_mjcf(self, values: Mapping[str, Scalar]) -> str | None:
-        """Return the model with identified values, as MJCF; None: there is none."""
-        return None
-
-    @property
-    def late(self) -> Late:
-        """The timing in C MuJoCo that the text of this MJCF does not hold; default: none."""
-        from sim2real.identification.export.targets import Late
-
-        return Late()
-
-    def plain_simulation(self, values: Mapping[str, float]) -> PlainSimulation | None:
-        """Return the robot with identified values as a simulation in plain MuJoCo; None: there is none."""
-        return None
+    mjcf: str
+    late: Late
+    plain: Callable[[], PlainSimulation]
 
 
-class RobotModel(Simulated, ABC):
+class RobotModel(ABC):
     """The robot in simulation, and the parameters that identification estimates.
 
     An entry point of the group ``sim2real.worlds`` makes one from a robot, for ``--world NAME``.
 
     Attributes:
         tick_s: The world's period [s].
-        needs_gpu: Whether a training takes hours without a GPU.
+        causes: Causes that change several parameters at once: name -> parameter -> change of the parameter on its scale
+            when the cause grows by a factor of e.
     """
 
     tick_s: float
-    needs_gpu: bool = False
+    causes: Mapping[str, Mapping[str, float]] = _NOTHING
 
     @abstractmethod
     def dynamics(self) -> list[Parameter]:
@@ -277,7 +264,8 @@ class RobotModel(Simulated, ABC):
     def make_world(self, resumed: bool = False) -> BaseNode:
         """Return the world's node; ``resumed``: episodes begin in the middle of a recording.
 
-        A world with a ``lead_s`` adds that time to the actuator's delay [s].
+        A world with a ``lead_s`` adds that time to the actuator's delay [s]. Its ``true_state`` returns the part of a
+        state that a value function may observe in simulation; without one, it is all of it.
         """
 
     @abstractmethod
@@ -288,13 +276,9 @@ class RobotModel(Simulated, ABC):
         """Return the model of a training with values and draws of parameters; default: this one."""
         return self
 
-    def unidentified(self) -> dict[str, float]:
-        """Return parameters of training that no log determines, with their nominal values; default: none."""
-        return {}
-
-    def true_state(self, state: PyTree) -> PyTree:
-        """Return the part of the world's state that a value function may observe in simulation; default: all of it."""
-        return state
+    def exported(self, values: Mapping[str, Scalar]) -> Exported | None:
+        """Return the model with identified values for other simulators; default: None, there is none."""
+        return None
 
     def following(self, values: Mapping[str, float]) -> Following | None:
         """Return how joints with identified values follow their commands; None: as the device says."""
@@ -308,14 +292,12 @@ class RecordedRobot(ABC):
         name: Name of its pipeline, which ``load_robot`` sets; of a robot without a folder the name of its class.
         folder: Folder of its pipeline; None: it has none, and no command finds it by its name.
         defaults: Default settings of its stages; None: those of ``sim2real.stages.config.Defaults``.
-        mapping: Mapping of its logs of other recorders, if it has no folder; a folder has an ``import.toml``.
         units: Field of a message -> its unit.
     """
 
     name: str = ""
     folder: Path | None = None
     defaults: Defaults | None = None
-    mapping: ImportMapping | None = None
     units: Mapping[str, str]
 
     def __init_subclass__(cls) -> None:
@@ -325,48 +307,21 @@ class RecordedRobot(ABC):
     def identifiable(self, max_delay_s: float) -> IdentifiableModel:
         """Return the model to identify, with delays of up to ``max_delay_s`` [s]."""
 
-    @property
-    def simulated(self) -> Simulated:
-        """What exports and the drift test ask of its model; default: nothing."""
-        return Simulated()
-
-    def with_optional_terms(self, wanted: str) -> RecordedRobot:
-        """Return the robot with further optional terms; default: the robot, which has all of them.
-
-        Args:
-            wanted: ``auto``, ``all``, or names separated by commas.
-        """
-        return self
-
-    def doubts(self, outputs: Mapping[str, PyTree]) -> list[str]:
-        """Return sentences on positions of a log that the model cannot have; default: none."""
-        return []
+    def exported(self, values: Mapping[str, Scalar]) -> Exported | None:
+        """Return its model with identified values for other simulators; default: None, there is none."""
+        return None
 
 
 class Robot(RecordedRobot):
-    """A robot that can be recorded, trained for and deployed to. It has three parts, which its ``__init__`` sets.
-
-    Attributes:
-        tasks: Further tasks by name; see ``with_task``.
-    """
+    """A robot that can be recorded, trained for and deployed to. It has three parts, which its ``__init__`` sets."""
 
     drive: RobotDrive
     task: RobotTask
     model: RobotModel
-    tasks: Mapping[str, RobotTask] = _NOTHING
-
-    @property
-    def rate_hz(self) -> float:
-        """Rate of sensor, agent and actuator [Hz]."""
-        return self.drive.rate_hz
 
     @property
     def units(self) -> Mapping[str, str]:
         return {**self.drive.units, **self.task.units}
-
-    @property
-    def simulated(self) -> RobotModel:
-        return self.model
 
     def nominal(self) -> dict[str, float]:
         """Return the nominal values of the model's parameters, without delays."""
@@ -375,19 +330,8 @@ class Robot(RecordedRobot):
     def identifiable(self, max_delay_s: float) -> IdentifiableModel:
         return IdentifiableLoop(self, max_delay_s)
 
-    def with_task(self, name: str) -> Self:
-        """Return the robot with another of its tasks, such as ``follow`` of an arm; identifications stay valid.
-
-        Raises:
-            UsageError: It has no task of this name.
-        """
-        if name not in self.tasks:
-            raise UsageError(
-                f"robot {self.name!r} has no further task {name!r}. Available: {', '.join(self.tasks) or 'none'}"
-            )
-        robot = copy.copy(self)
-        robot.task = self.tasks[name]
-        return robot
+    def exported(self, values: Mapping[str, Scalar]) -> Exported | None:
+        return self.model.exported(values)
 
 
 PARTS: Mapping[str, type] = {
@@ -434,11 +378,15 @@ def _unset(owner: object, kind: type) -> list[str]:
     return [name for name in kind.__annotations__ if name not in vars(kind) and not hasattr(owner, name)]
 
 
+PAYLOAD = "payload"
+"""Name of a mass in a robot's hand: a parameter, and its optional term."""
+
+
 def watched(robot: RecordedRobot, max_delay_s: float) -> IdentifiableModel:
-    """Return the model to identify with all parameters that may change between deployments, such as a payload."""
+    """Return the model to identify with the payload, if it is a term: it may change between deployments."""
     model = robot.identifiable(max_delay_s)
-    if terms := robot.simulated.watched_terms:
-        model.parameters = model.parameters.with_terms([*model.parameters.terms, *terms])
+    if isinstance(robot, Robot) and any(p.term == PAYLOAD for p in model.parameters):
+        model.parameters = model.parameters.with_terms([*model.parameters.terms, PAYLOAD])
     return model
 
 

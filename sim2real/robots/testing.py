@@ -157,7 +157,7 @@ def _check_judgement(judged: Mapping[str, Any]) -> None:
 def _check_score(robot: Robot, measured: Mapping[str, np.ndarray], sent: Mapping[str, np.ndarray]) -> None:
     for name, values in (*measured.items(), *sent.items()):
         _hold(bool(np.isfinite(values).all()), f"{name} is not finite in simulation: {values}")
-    t_s = np.arange(len(next(iter(measured.values())))) / robot.rate_hz
+    t_s = np.arange(len(next(iter(measured.values())))) / robot.drive.rate_hz
     score = robot.task.score(t_s, {**sent, **measured})
     _include(score, {"success"}, "figures of the score")
     _hold(0.0 <= score["success"] <= 1.0, f"success is {score['success']}, not a share")

@@ -102,7 +102,7 @@ def training_loop(
     sensor = SimSensor(SENSOR, drive.rate_hz, world, **on_sensor)
     sensor.noise = robot.drive.noise
     nodes = simulated_loop(sensor, agent, _sim_actuator(robot, **on_actuator), world, bounds)
-    return nodes, LoopTask(robot, agent, values, draws)
+    return nodes, LoopTask(robot, agent, world, values, draws)
 
 
 def simulation_params(
@@ -139,9 +139,15 @@ class LoopTask(TrainingTask):
     has_curriculum = True
 
     def __init__(
-        self, robot: Robot, agent: PolicyAgent, values: Mapping[str, float], draws: Mapping[str, np.ndarray]
+        self,
+        robot: Robot,
+        agent: PolicyAgent,
+        world: BaseNode,
+        values: Mapping[str, float],
+        draws: Mapping[str, np.ndarray],
     ) -> None:
         self.robot, self.agent = robot, agent
+        self._true_state = getattr(world, "true_state", lambda state: state)
         self.values: dict[str, PyTree] = dict(values)
         self.draws = {n: jnp.asarray(d, jnp.float32) for n, d in draws.items()}
         self.observation_size = observation_size(robot.task.observation)
@@ -198,7 +204,7 @@ class LoopTask(TrainingTask):
         return jnp.asarray(self.robot.task.judge(graph_state, jnp.zeros(len(self.action_low))).ended)
 
     def privileged(self, graph_state: GraphState) -> jax.Array:
-        state = self.robot.model.true_state(graph_state.state[WORLD])
+        state = self._true_state(graph_state.state[WORLD])
         numbers = [x for x in map(jnp.asarray, jax.tree.leaves((state, graph_state.params)))]
         numbers = [x for x in numbers if jnp.issubdtype(x.dtype, jnp.inexact)]
         return jnp.concatenate([x.astype(jnp.float32).ravel() for x in numbers])
@@ -249,7 +255,7 @@ class IdentifiableLoop:
     def nodes(self, max_delay_s: float) -> dict[str, BaseNode]:
         """Return sensor, actuator and world, connected with delays of up to ``max_delay_s`` [s]."""
         robot, world = self._robot, self._robot.model.make_world(resumed=True)
-        sensor = SimSensor(SENSOR, robot.rate_hz, world)
+        sensor = SimSensor(SENSOR, robot.drive.rate_hz, world)
         return recorded_loop(sensor, _sim_actuator(robot), world, max_delay_s, self.ahead_s, _lead_s(world))
 
     def reached(self, recordings: Sequence[Episode]) -> Mapping[str, float]:

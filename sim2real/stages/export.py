@@ -79,8 +79,8 @@ def write_export(
         note(f"verdict: {status}; the file contains the verdict, too")
     # Put the estimates into the robot's model; optional terms that were not identified are switched off.
     off, sides = {p.name: p.nominal for p in model.parameters}, {p.name: p.side for p in model.parameters}
-    text = robot.simulated.identified_mjcf({**off, **identification.values})
-    terms = None if text is None else find_terms(identification, lambda values: _text(robot, {**off, **values}), sides)
+    exported = robot.exported({**off, **identification.values})
+    terms = exported and find_terms(identification, lambda values: _text(robot, {**off, **values}), sides)
     # Write the format: JSON and a card need no model, the others need one.
     if to in ("json", "card"):
         about = about if to == "json" else [row for row in about if row[0] != "log"]  # no path of this machine
@@ -90,13 +90,13 @@ def write_export(
         else:
             write_model_card(out, identification, robot, model, document, run_dir)
         return
-    if text is None or terms is None:
+    if exported is None or terms is None:
         raise _no_model(identification, model.parameters, to)
     if terms.unexpressed:
         note(f"not expressed in {to}: {', '.join(terms.unexpressed)}")
         about = [*about, ("not expressed", ", ".join(terms.unexpressed))]
     if to == "mjcf":
-        content = late_mjcf(text, terms, robot.simulated.late, about)
+        content = late_mjcf(exported.mjcf, terms, exported.late, about)
     else:
         title = f"Actuators and randomisation of {identification.pipeline!r}, as sim2real identified them."
         content = source_of(to, terms, title, about)
@@ -122,7 +122,8 @@ def write_model_card(
     """
     if folder.is_file() or (folder.is_dir() and any(folder.iterdir()) and not (folder / "card.json").is_file()):
         raise UsageError(f"{folder} is there and holds no model card", hint="name another folder with --out")
-    plain = robot.simulated.plain_simulation({p.name: p.nominal for p in model.parameters} | identification.values)
+    exported = robot.exported({p.name: p.nominal for p in model.parameters} | identification.values)
+    plain = None if exported is None else exported.plain()
     card, signals = write_card(
         folder, identification, model, plain, document, _session(identification, SENSOR, run_dir)
     )
@@ -170,10 +171,9 @@ def _of_motors(values: Json) -> str:
 
 
 def _text(robot: RecordedRobot, values: Mapping[str, float]) -> str:
-    text = robot.simulated.identified_mjcf(values)
-    if text is None:
+    if (exported := robot.exported(values)) is None:
         raise UsageError(f"robot {type(robot).__name__} has a MuJoCo model for some values and none for others")
-    return text
+    return exported.mjcf
 
 
 def _no_model(identification: Identification, table: ParameterTable, to: str) -> UsageError:

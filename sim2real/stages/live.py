@@ -40,8 +40,10 @@ def scene_of(robot: RecordedRobot) -> dict[str, Json]:
     if not isinstance(robot, Robot):
         return {}
     columns = {name: fields["position"] for name, fields in joint_columns(robot.drive.channels).items()}
+    if (exported := robot.exported(robot.nominal())) is not None:
+        return {"mjcf": exported.mjcf, "columns": columns}
     file = getattr(robot, "mjcf", None)  # of a walking robot, which has no model for others
-    return {"mjcf": robot.model.identified_mjcf(robot.nominal()) or (str(file) if file else None), "columns": columns}
+    return {"mjcf": str(file) if file else None, "columns": columns}
 
 
 def drawn(scene: Mapping[str, Json]) -> Scene | None:

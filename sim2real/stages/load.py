@@ -130,7 +130,9 @@ def mapping_of(robot: RecordedRobot, path: Path) -> ImportMapping | None:
     if not path.is_file() or is_ours(path):
         return None
     if robot.folder is None:
-        return robot.mapping
+        from sim2real.robots.identified import LoggedRobot
+
+        return robot.mapping if isinstance(robot, LoggedRobot) else None
     return load_mapping(file) if (file := robot.folder / MAPPING).is_file() else None
 
 

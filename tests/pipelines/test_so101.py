@@ -55,7 +55,7 @@ def test_no_goal_leads_into_the_table(plant):
 
 
 def test_excitations_aims_and_rest_are_within_the_limits(plant):
-    signal = excitation(PIPELINE.defaults.record, ROBOT.rate_hz, 6) + ROBOT.drive.centre
+    signal = excitation(PIPELINE.defaults.record, ROBOT.drive.rate_hz, 6) + ROBOT.drive.centre
     inside = (signal >= LOW - 1e-9) & (signal <= HIGH + 1e-9)
     assert inside.mean(axis=0).min() > 0.85, "the gate cuts little"
     assert np.ptp(np.clip(signal, LOW, HIGH), axis=0).min() > 0.5

@@ -10,15 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, InputState, StepState
 from sim2real.robots.agent import AgentParams
 from sim2real.robots.messages import JointReading
-from sim2real.robots.servo.targets import AHEAD_S, FIGURE_HZ, FIGURE_M, arrival, figure_of_eight
 from sim2real.stages.load import load_module, load_robot
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
 from benches.hidden import arms
+from benches.hidden.targets import AHEAD_S, FIGURE_HZ, FIGURE_M, arrival, figure_of_eight, tasked
 
 THERE = {"arm": (0.5, 0.4, 0.3), "so101": (0.5, -0.8, 1.0, -1.2, 0.0, 0.0)}
 STEPS = 0.02 * np.arange(200)
@@ -70,7 +69,7 @@ def test_the_figure_of_eight_goes_to_either_side_twice_as_slowly_as_up_and_down(
 
 
 def test_every_point_of_the_drawn_figures_is_within_reach(arm):
-    task = arm.robot.with_task("follow").task
+    task = tasked(arm.robot, "follow").task
     for trial in range(12):
         numbers = task.at_rest(trial).aim
         q = arm.there
@@ -88,7 +87,7 @@ def state_of(position, t_s, aim):
 
 def test_reward_and_success_are_those_of_the_target_now(arm):
     for name in ("follow", "fast"):
-        task = arm.robot.with_task(name).task
+        task = tasked(arm.robot, name).task
 
         def judged(turn, task=task):
             now = arm.there + turn * np.eye(len(arm.there))[0]
@@ -105,7 +104,7 @@ def test_reward_and_success_are_those_of_the_target_now(arm):
 
 
 def test_the_policy_sees_the_target_of_its_step_and_the_task_judges_that_of_the_worlds_time(arm):
-    robot = arm.robot.with_task("follow")
+    robot = tasked(arm.robot, "follow")
     start = robot.task.at_rest(3)
     node, params = robot.task.make_agent(50.0), AgentParams.of(start)
     state = node.init_state(None, GraphState(params={"agent": params}))
@@ -129,14 +128,10 @@ def test_the_policy_sees_the_target_of_its_step_and_the_task_judges_that_of_the_
         assert there > 2.9 > ahead
 
 
-def test_a_robot_has_its_tasks_by_name_and_refuses_another(arm):
-    assert set(arm.robot.tasks) == {"follow", "fast"}
-    fast = arm.robot.with_task("fast")
+def test_the_goals_of_a_further_task_are_faster_and_the_robot_stays(arm):
+    fast = tasked(arm.robot, "fast")
     assert (fast.name, fast.model) == (arm.robot.name, arm.robot.model)
     assert fast.task.action[0].high > arm.robot.task.action[0].high
-    assert arm.robot.task is not fast.task
-    with pytest.raises(UsageError, match="juggle"):
-        arm.robot.with_task("juggle")
 
 
 @pytest.mark.parametrize(
@@ -156,7 +151,7 @@ def test_a_tip_that_passes_by_has_not_arrived(distance_mm, settled_s, success, o
 
 
 def test_scores_compare_with_the_target_of_each_time(arm):
-    robot = arm.robot.with_task("follow")
+    robot = tasked(arm.robot, "follow")
     numbers, q, path = robot.task.at_rest(1).aim, arm.there, []
     for t_s in STEPS:
         q, _ = joints_at(arm, figure_of_eight(numbers, t_s), q)
@@ -176,7 +171,7 @@ def test_scores_compare_with_the_target_of_each_time(arm):
 
 
 def test_goals_that_are_ahead_by_delay_and_lag_follow_the_figure_on_a_hidden_arm_and_others_do_not(arm):
-    robot, hidden = arm.robot.with_task("follow"), replace(arms.HiddenArm.draw(arm.name, 1, 2), load_kg=0.0)
+    robot, hidden = tasked(arm.robot, "follow"), replace(arms.HiddenArm.draw(arm.name, 1, 2), load_kg=0.0)
     numbers, q = robot.task.at_rest(0).aim, arm.there
     path = []
     for t_s in np.arange(0.0, 1 / FIGURE_HZ + 1e-9, 0.02):

@@ -60,7 +60,7 @@ def play_on_c(robot, values, position, velocity, goals):
     """Play goals ``(T, n)`` of every tick on C MuJoCo, in plain numpy; return setpoints of each physics step, and
     positions and speeds after each tick.
     """
-    model = mujoco.MjModel.from_xml_string(robot.model.identified_mjcf(values))
+    model = mujoco.MjModel.from_xml_string(robot.model.exported(values).mjcf)
     data, sheet = mujoco.MjData(model), robot.drive.servos.sheet
     model.opt.timestep, step_s = robot.model.step_s, robot.model.step_s
     data.qpos[:], data.qvel[:] = position, velocity

@@ -17,6 +17,9 @@ class BareDrive(RobotDrive):
     def prepare(self, rig, settle_s):
         """Do nothing."""
 
+    def read(self, reading):
+        """Do nothing."""
+
 
 class Bare(Robot):
     """A robot that has one part."""

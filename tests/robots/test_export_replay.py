@@ -15,13 +15,14 @@ from sim2real.graph.base import Base
 from sim2real.graph.episode import Episode, Steps
 from sim2real.graph.node import BaseNode
 from sim2real.identification.config import FitConfig
-from sim2real.identification.export.targets import late_mjcf
+from sim2real.identification.export.targets import Late, late_mjcf
 from sim2real.identification.export.terms import find_terms
 from sim2real.identification.model import Channel
 from sim2real.identification.parameters import Parameter
 from sim2real.identification.residuals import Problem
 from sim2real.identification.segments import Span
 from sim2real.robots.identified import LoggedRobot
+from sim2real.robots.robot import Exported
 from sim2real.worlds.mjx import MjxWorld
 from sim2real.worlds.recorded import RecordedActuator, command_delay
 
@@ -84,13 +85,13 @@ class Hinge(LoggedRobot):
         world = params["world"].replace(qpos=start[:1], qvel=start[1:])
         return {**params, "world": world}
 
-    def identified_mjcf(self, values):
+    def exported(self, values):
         spec = mujoco.MjSpec.from_string(XML)
         model = spec.compile()
         model.dof_damping[0], model.dof_frictionloss[0] = values["damping"], values["friction"]
         model.dof_armature[0], model.body_mass[1] = values["armature"], values["mass"]
         spec.copy_back(model)
-        return spec.to_xml()
+        return Exported(spec.to_xml(), Late(), None)
 
 
 def steps(ticks):
@@ -112,7 +113,7 @@ def found():
 def terms(found):
     robot = Hinge()
     sides = {p.name: p.side for p in robot.identifiable(0.03).parameters}
-    return find_terms(found, robot.identified_mjcf, sides)
+    return find_terms(found, lambda values: robot.exported(values).mjcf, sides)
 
 
 def test_intervals_are_those_of_the_posterior_field_by_field(terms):
@@ -169,7 +170,8 @@ def test_the_exported_file_alone_does_in_c_what_the_graph_predicts(terms):
     """Off by less than 1 % of the motion: commands, delays of both sides, friction that sticks."""
     robot = Hinge()
     ts, ours = predicted(robot, FOUND, "action", GOALS, ())
-    text = late_mjcf(robot.identified_mjcf(FOUND), terms, robot.late, [])
+    exported = robot.exported(FOUND)
+    text = late_mjcf(exported.mjcf, terms, exported.late, [])
     rows = played(text, "hinge", GOALS)
     assert np.ptp(ours) > 0.5
     off = lambda early_s: np.sqrt(np.mean((np.interp(ts - early_s, *rows) - ours) ** 2)) / np.std(ours)  # noqa: E731

@@ -89,7 +89,7 @@ def test_the_share_is_the_models_own_unless_it_is_chosen_and_none_without_gravit
         assert ("gravcomp" in found) == ("gravity" not in without)
         if "gravcomp" in found:
             assert found["gravcomp"].without == 1.0
-            text = other.identified_mjcf(
+            text = other.exported(
                 {p.parameter.name: p.parameter.nominal for p in other.placed} | {"gravcomp": 0.6}
-            )
+            ).mjcf
             assert text.count('gravcomp="0.6"') == 1

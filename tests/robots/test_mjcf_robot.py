@@ -202,7 +202,7 @@ def test_a_description_survives_its_file(tmp_path, model_file):
 
 def test_identified_friction_leaves_as_mjcf(model_file):
     robot = MjcfRobot(config(model_file, terms=(ParameterPattern("damping"), ParameterPattern("armature", each=True))))
-    text = robot.identified_mjcf({"damping": 0.33, "armature_left_hip": 0.07, "armature_left_knee": 0.08})
+    text = robot.exported({"damping": 0.33, "armature_left_hip": 0.07, "armature_left_knee": 0.08}).mjcf
     model = mujoco.MjModel.from_xml_string(text)
     np.testing.assert_allclose(model.dof_damping, [0.33, 0.33, 0.0])
     np.testing.assert_allclose(model.dof_armature, [0.07 - 0.001 * 0.33, 0.08 - 0.001 * 0.33, 0.0])
@@ -266,7 +266,7 @@ def test_the_armature_is_the_rotors_whatever_the_time_step(tmp_path):
     robot = MjcfRobot(config(path, joints=("left_hip",), commands=("torque",), step_s=0.005, terms=terms))
     values = {"armature": 0.03, "damping": 1.0, "frictionloss": 1e-9}
     world = robot.identifiable(0.02).params({**values, "delay": 0.0}, jnp.zeros(2))["world"].model
-    model = mujoco.MjModel.from_xml_string(robot.identified_mjcf(values))
+    model = mujoco.MjModel.from_xml_string(robot.exported(values).mjcf)
     np.testing.assert_allclose(world.dof_armature, model.dof_armature, rtol=1e-6)
     data = mujoco.MjData(model)
     data.qvel[0] = 1.0
@@ -274,4 +274,4 @@ def test_the_armature_is_the_rotors_whatever_the_time_step(tmp_path):
     assert data.qvel[0] == pytest.approx(np.exp(-0.08 * 1.0 / 0.04), rel=0.01)
     # So much inertia is the integrator's already that no rotor is left.
     heavy = MjcfRobot(config(path, joints=("left_hip",), commands=("torque",), step_s=0.1, terms=terms))
-    assert mujoco.MjModel.from_xml_string(heavy.identified_mjcf(values)).dof_armature[0] == 0.0
+    assert mujoco.MjModel.from_xml_string(heavy.exported(values).mjcf).dof_armature[0] == 0.0

@@ -106,7 +106,7 @@ def test_the_so101_whose_friction_wears_off_with_speed(tmp_path):
     robot = pipeline
     model = robot.identifiable(MAX_DELAY_S)
     truth = {p.name: p.nominal for p in model.parameters} | {"sensor_delay": 0.008, "actuator_delay": 0.012}
-    signal = excitation(RecordConfig(duration_s=6.0, amplitude=0.4), robot.rate_hz, 6) + robot.drive.centre
+    signal = excitation(RecordConfig(duration_s=6.0, amplitude=0.4), robot.drive.rate_hz, 6) + robot.drive.centre
     episode = simulate(model, robot, signal, truth, FitConfig(max_delay_s=MAX_DELAY_S))
     count = 2 * np.pi / 4096
     episode.outputs["sensor"]["position"] = np.round(episode.outputs["sensor"]["position"] / count) * count

@@ -37,7 +37,7 @@ def weights(robot):
 def runner(robot, weights):
     bounds = zip(robot.task.action, weights["low"].tolist(), weights["high"].tolist(), strict=True)
     actions = tuple(ActionTerm(a.name, a.unit, low, high) for a, low, high in bounds)
-    return make_runner(weights, PolicyContract(robot.task.observation, actions, robot.rate_hz))
+    return make_runner(weights, PolicyContract(robot.task.observation, actions, robot.drive.rate_hz))
 
 
 def steps_of(node, robot, policy):
@@ -60,15 +60,15 @@ def leaves(tree):
 
 
 def test_it_does_what_the_agent_does_with_the_policy_in_jax(robot, weights, runner):
-    found, _ = steps_of(PolicyNode(robot.task.make_agent(robot.rate_hz), runner), robot, None)
-    expected, _ = steps_of(robot.task.make_agent(robot.rate_hz), robot, Policy.from_weights(weights))
+    found, _ = steps_of(PolicyNode(robot.task.make_agent(robot.drive.rate_hz), runner), robot, None)
+    expected, _ = steps_of(robot.task.make_agent(robot.drive.rate_hz), robot, Policy.from_weights(weights))
     for ours, theirs in zip(found, expected, strict=True):
         for a, b in zip(leaves(ours), leaves(theirs), strict=True):
             np.testing.assert_allclose(a, b, atol=1e-5)
 
 
 def test_a_step_on_the_robot_calls_nothing_of_jax(robot, runner, monkeypatch):
-    node = PolicyNode(robot.task.make_agent(robot.rate_hz), runner)
+    node = PolicyNode(robot.task.make_agent(robot.drive.rate_hz), runner)
     params = in_numpy(node.init_params(None, GraphState()))
     state = node.init_state(None, GraphState(params={node.name: params}))
 
@@ -85,5 +85,5 @@ def test_a_step_on_the_robot_calls_nothing_of_jax(robot, runner, monkeypatch):
 def test_an_episode_begins_with_a_reset(robot, runner, monkeypatch):
     begun = []
     monkeypatch.setattr(runner, "reset", lambda: begun.append(1), raising=False)
-    PolicyNode(robot.task.make_agent(robot.rate_hz), runner).startup(GraphState())
+    PolicyNode(robot.task.make_agent(robot.drive.rate_hz), runner).startup(GraphState())
     assert begun == [1]

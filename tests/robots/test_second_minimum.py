@@ -23,7 +23,7 @@ COUNT_RAD = 2 * np.pi / 4096
 def test_a_fit_that_ends_in_the_second_minimum_goes_on_to_the_first():
     robot = load_robot("arm")
     model = robot.identifiable(0.06)
-    signal = excitation(RecordConfig(duration_s=12.0, amplitude=0.8), robot.rate_hz, 3) + robot.drive.centre
+    signal = excitation(RecordConfig(duration_s=12.0, amplitude=0.8), robot.drive.rate_hz, 3) + robot.drive.centre
     config = FitConfig(max_delay_s=0.06)
     values = {p.name: p.nominal for p in model.parameters} | TRUTH | {"sensor_delay": 0.0}
     episode = simulate(model, robot, signal, values, config)

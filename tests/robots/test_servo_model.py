@@ -72,7 +72,7 @@ def test_friction_that_wears_off_lets_a_joint_move_faster():
 def test_parameters_are_in_the_graph_as_in_the_exported_model(name):
     robot = load_robot(name)
     values = robot.nominal() | {"payload": 0.1, "damping": 0.3, "goal_offset_elbow_flex": 0.02}
-    exported = mujoco.MjModel.from_xml_string(robot.model.identified_mjcf(values))
+    exported = mujoco.MjModel.from_xml_string(robot.model.exported(values).mjcf)
     for field, numbers in robot.model.fields(values).items():
         np.testing.assert_allclose(getattr(exported, field), numbers, rtol=1e-4, atol=1e-7, err_msg=field)
     own = robot.model.model
@@ -92,7 +92,7 @@ def test_a_gear_is_in_the_model_and_not_in_the_servos_parameters(pair):
     for name, power in powers.items():
         expected = np.asarray(plain[name]).T * gears**power
         np.testing.assert_allclose(np.asarray(geared[name]).T, expected, rtol=1e-6, err_msg=name)
-    np.testing.assert_allclose(robot.model.plain_simulation(robot.nominal()).numbers["profile_rad_s"], 2.0 / gears)
+    np.testing.assert_allclose(robot.model.exported(robot.nominal()).plain().numbers["profile_rad_s"], 2.0 / gears)
 
 
 def test_inertia_makes_up_for_what_the_implicit_step_adds(pair):

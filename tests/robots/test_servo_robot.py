@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from small_robot import SERVOS, SHEET, VALUES, PairRobot
 
+from sim2real.graph.base import GraphState
+from sim2real.robots.agent import AgentParams
 from sim2real.robots.messages import EpisodeStart
 from sim2real.robots.nodes import recording_nodes
 from sim2real.robots.servo.servos import DataSheet
-from sim2real.robots.servo.task import ServoMoment
 from sim2real.robots.training import node_parameters, simulation_params
 
 
@@ -46,8 +47,9 @@ def test_nominal_values_are_the_data_sheets_without_delays(pair):
 
 
 def test_fast_goals_cost_a_hundredth_of_the_mean_square_of_their_share_of_the_largest_speed(pair):
-    now = ServoMoment(jnp.array([0.1, 0.2]), jnp.zeros(2), jnp.zeros(1))
-    terms = pair.task.reward(now, jnp.array([2.0, -1.0]))  # of 2 rad/s
+    world = SimpleNamespace(position=jnp.array([0.1, 0.2]), velocity=jnp.zeros(2))
+    now = GraphState(state={"world": world}, params={"agent": AgentParams(aim=jnp.zeros(1))})
+    terms = pair.task.judge(now, jnp.array([2.0, -1.0])).reward  # of 2 rad/s
     assert {n: float(v) for n, v in terms.items()} == {"task": pytest.approx(-0.05), "speed": pytest.approx(-0.00625)}
 
 
@@ -91,7 +93,7 @@ def test_a_recording_begins_where_the_joints_are(pair):
     played = np.array([agent.step(SimpleNamespace(seq=k))[1].goal for k in range(100)])
     np.testing.assert_allclose(played[0], reading.position_rad)
     off = np.abs(played - signal)
-    assert np.abs(np.diff(off, axis=0)).max() <= 1.0 / pair.rate_hz + 1e-9
+    assert np.abs(np.diff(off, axis=0)).max() <= 1.0 / pair.drive.rate_hz + 1e-9
     np.testing.assert_array_equal(played[51:], signal[51:])
     np.testing.assert_array_equal(played[16:, 1], signal[16:, 1])
 

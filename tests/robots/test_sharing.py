@@ -71,5 +71,5 @@ def test_a_joint_with_another_stiffness_gets_a_factor(recorded):
     assert found.values["kp_of_lift_alone"] == pytest.approx(KP[1] / KP[0], rel=0.05)
     assert found.values["damping"] == pytest.approx(DAMPING, rel=0.05)
     # The model with these values has both stiffnesses.
-    made = mujoco.MjModel.from_xml_string(robot.identified_mjcf(found.values))
+    made = mujoco.MjModel.from_xml_string(robot.exported(found.values).mjcf)
     assert made.actuator_gainprm[:, 0] == pytest.approx(KP, rel=0.06)

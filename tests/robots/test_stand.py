@@ -87,7 +87,7 @@ def test_the_emulator_names_its_parameters_as_an_identification_does(log):
     _, truth = log
     names = {p.name for p in ROBOT.identifiable(0.06).parameters}
     assert names - {"motor_strength"} <= set(truth)
-    assert set(truth) - names == set(ROBOT.model.unidentified()) - {"roughness"}
+    assert set(truth) - names == set(ROBOT.nominal()) - names - {"roughness"}
 
 
 def test_each_group_and_each_motor_has_its_value_in_training_and_on_the_twin():

@@ -57,7 +57,7 @@ def test_the_identified_model_holds_its_joints_as_the_identification_did(model_f
         RobotConfig(model_file(), ("lift",), ("torque",), step_s=STEP_S, terms=usual_patterns(("torque",)))
     )
     values = {p.name: 1.0 if p.name.startswith("frictionloss") else p.nominal for p in robot.dynamics()}
-    exported = mujoco.MjModel.from_xml_string(robot.identified_mjcf(values))
+    exported = mujoco.MjModel.from_xml_string(robot.exported(values).mjcf)
     np.testing.assert_allclose(exported.dof_solref, robot.model.dof_solref)
     np.testing.assert_allclose(exported.dof_solimp, robot.model.dof_solimp)
     assert crept(exported) < 1e-3
@@ -67,7 +67,7 @@ def test_the_identified_model_holds_its_joints_as_the_identification_did(model_f
 def test_an_exported_servo_robot_rests_where_friction_holds_it(name):
     """With a single iteration of the solver, as in training, its joints shiver and creep."""
     robot = load_robot(name)
-    model = mujoco.MjModel.from_xml_string(robot.model.identified_mjcf(robot.nominal()))
+    model = mujoco.MjModel.from_xml_string(robot.model.exported(robot.nominal()).mjcf)
     model.opt.gravity[:], model.dof_frictionloss[:] = 0.0, 0.2
 
     def fastest():

@@ -178,9 +178,9 @@ def test_logs_that_are_not_of_a_robot_on_its_feet_are_refused(tmp_path, standing
 
 
 def test_the_legs_bend_slowly_towards_the_folded_ones():
-    goals = bent_legs(ROBOT.drive.crouch, 10.0, ROBOT.rate_hz) + ROBOT.drive.centre
+    goals = bent_legs(ROBOT.drive.crouch, 10.0, ROBOT.drive.rate_hz) + ROBOT.drive.centre
     assert len(goals) == 500
     np.testing.assert_allclose(goals[0], ROBOT.stance, atol=1e-6)
     share = (goals - ROBOT.stance) / (np.asarray(ROBOT.motors.folded) - ROBOT.stance)
     assert share.max() == pytest.approx(0.25, abs=0.01)
-    assert np.abs(np.diff(goals, axis=0)).max() * ROBOT.rate_hz < 0.4
+    assert np.abs(np.diff(goals, axis=0)).max() * ROBOT.drive.rate_hz < 0.4

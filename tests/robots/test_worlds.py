@@ -62,7 +62,7 @@ def test_another_world_has_its_own_parameters_and_the_robot_the_rest(table):
     assert [p.name for p in oiled.model.dynamics()] == ["loop", "friction", "drag"]
     assert oiled.identifiable(0.05).parameters.names[2:] == ("drag", "actuator_delay")
     assert [p.name for p in table.model.dynamics()] == ["loop", "friction"]
-    assert (oiled.drive, oiled.units, oiled.rate_hz) == (table.drive, table.units, table.rate_hz)
+    assert (oiled.drive, oiled.units, oiled.drive.rate_hz) == (table.drive, table.units, table.drive.rate_hz)
     params = oiled.identifiable(0.05).params(VALUES, jnp.array([0.5, -2.0]))
     world = params["world"]
     assert (float(world.loop), float(world.friction), float(world.drag)) == (20.0, 3.0, 4.0)

@@ -35,7 +35,7 @@ def contract_of(robot, /, **changes):
     fits = {
         "observation": robot.task.observation,
         "action": actions,
-        "rate_hz": robot.rate_hz,
+        "rate_hz": robot.drive.rate_hz,
         "limits": robot.task.limits,
     }
     return PolicyContract(**{**fits, **changes})

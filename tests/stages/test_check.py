@@ -139,7 +139,7 @@ def test_what_is_planned_is_simulated_from_where_the_robot_hangs():
     model = robot.identifiable(0.06)
     record = RecordConfig(duration_s=2.0, amplitude=1.0, low_hz=0.7, high_hz=2.0)
     table, fitting = model.parameters, replace(pipeline.defaults.identify, max_delay_s=0.06)
-    signal = excitation(record, robot.rate_hz).reshape(-1, 1)
+    signal = excitation(record, robot.drive.rate_hz).reshape(-1, 1)
     episode = simulate(model, robot, signal, table.decode(table.start()), fitting)
     th = episode.outputs["sensor"]["th"]
     assert len(th) == len(episode.steps["sensor"])

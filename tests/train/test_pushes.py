@@ -46,7 +46,7 @@ def loop(robot):
 
 @pytest.fixture
 def pushes(robot, loop):
-    return Pushes.of(VariationConfig(push=2.0, push_hz=10.0), loop[0]["world"], robot.rate_hz)
+    return Pushes.of(VariationConfig(push=2.0, push_hz=10.0), loop[0]["world"], robot.drive.rate_hz)
 
 
 def test_joints_are_pushed_as_often_and_as_hard_as_was_said(pushes):

@@ -167,8 +167,8 @@ def record(path: Path, arm: HiddenArm, robot: Any, seconds: float) -> None:
     from sim2real.stages.session.excitation import excitation
 
     config = replace(robot.defaults.record, duration_s=seconds, seed=arm.seed)
-    signal = excitation(config, robot.rate_hz, len(robot.task.action))
-    goals = approached(signal + robot.drive.centre, robot.drive.servos.at_rest, robot.rate_hz)
+    signal = excitation(config, robot.drive.rate_hz, len(robot.task.action))
+    goals = approached(signal + robot.drive.centre, robot.drive.servos.at_rest, robot.drive.rate_hz)
     played = play(replace(arm, load_kg=0.0), robot, lambda reading, k: goals[k], len(goals) / RATE_HZ, 0)
     commands = [Goals(row.astype(np.float32)) for row in played.goals]
     write_log(path, robot.name, played.times, played.readings, commands, {**robot.units})
@@ -181,7 +181,7 @@ def agent(robot: Any, runner: Callable[[np.ndarray], np.ndarray], trial: int) ->
     from sim2real.robots.loop import AGENT, SENSOR
     from sim2real.robots.nodes import in_numpy
 
-    node = robot.task.make_agent(robot.rate_hz)
+    node = robot.task.make_agent(robot.drive.rate_hz)
     params = in_numpy(AgentParams.of(robot.task.at_rest(trial)))
     state = in_numpy(node.init_state(None, GraphState(params={AGENT: params})))
 
@@ -198,7 +198,7 @@ def agent(robot: Any, runner: Callable[[np.ndarray], np.ndarray], trial: int) ->
 
 def judge(arm: HiddenArm, robot: Any, task: str, act: Act, trial: int, seconds: float) -> dict[str, float]:
     """Return the figures of a session with a trial's aim, by the true motion of the tip."""
-    from sim2real.robots.servo.targets import CLOSE_M, SETTLED_S, arrival
+    from benches.hidden.targets import CLOSE_M, SETTLED_S, arrival
 
     played = play(arm, robot, act, seconds, 1 + trial)
     tip = np.stack([played.states[f"tip[{i}]"] for i in range(3)], axis=-1)

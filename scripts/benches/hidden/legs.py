@@ -49,15 +49,15 @@ def record(
     legs = EmulatedLegs(body, config, truth)
     # Let the legs hang, then plan the way to the excitation from there; or let the robot stand up.
     if standing:
-        goals = bent_legs(robot.drive.crouch, seconds, robot.rate_hz) + robot.drive.centre
+        goals = bent_legs(robot.drive.crouch, seconds, robot.drive.rate_hz) + robot.drive.centre
         begin_ns = _stand_up(legs, robot)
     else:
         begin_ns = round(1e9 * HANG_S)
         legs.advance(begin_ns)
         config_of = replace(pipeline.defaults.record, duration_s=seconds, seed=seed)
         hanging = legs.state(begin_ns).record["motor_state"]["q"][:12]
-        signal = excitation(config_of, robot.rate_hz, len(robot.joints))
-        goals = approached(signal + robot.drive.centre, hanging, robot.rate_hz)
+        signal = excitation(config_of, robot.drive.rate_hz, len(robot.joints))
+        goals = approached(signal + robot.drive.centre, hanging, robot.drive.rate_hz)
     _play(path, legs, robot, goals, begin_ns, seed)
     truth.close()
 
@@ -72,7 +72,7 @@ def _play(path: Path, legs: Any, robot: Any, goals: np.ndarray, begin_ns: int, s
     took = {name: mean * rng.gamma(4.0, 0.25, count) for name, mean in _TOOK_S.items()}
     arrives = rng.uniform(0.0, 0.002, count)
     took["sensor"] += arrives
-    *begun, sent = one_after_another(count, took, robot.rate_hz)
+    *begun, sent = one_after_another(count, took, robot.drive.rate_hz)
     starts = dict(zip(took, begun, strict=True))
     readings, commands = [], []
     for k, goal in enumerate(goals):
@@ -95,8 +95,8 @@ def _stand_up(legs: Any, robot: Any) -> int:
     from sim2real.robots.walking.drive import StandUp, leg_command
 
     motion, start = StandUp(), np.asarray(robot.motors.folded)
-    for k in range(round(motion.duration_s * robot.rate_hz)):
-        t_s = k / robot.rate_hz
+    for k in range(round(motion.duration_s * robot.drive.rate_hz)):
+        t_s = k / robot.drive.rate_hz
         legs.advance(round(1e9 * t_s))
         target = motion.targets(t_s, start, start, np.asarray(robot.stance))
         legs.receive(command(_table(leg_command(target, motion.kp, motion.kd))), round(1e9 * t_s))

@@ -6,6 +6,7 @@ import copy
 import tomllib
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,7 @@ from sim2real.robots.model.parameters import (
     place,
     with_optional,
 )
+from sim2real.robots.robot import Exported
 from sim2real.types import MjModel, PyTree, Scalar
 from sim2real.worlds.drive_terms import NO_LIMIT
 from sim2real.worlds.driven import OF_PAYLOAD, DriveCommand, DrivenWorld, DriveParams
@@ -248,11 +250,11 @@ class MjcfRobot(LoggedRobot):
             voltage=zero,
         )
 
-    @property
-    def late(self) -> Late:
-        return Late(0.5 * self.config.step_s)  # for the integrator's sake, as `DrivenWorld` does in the graph
+    def exported(self, values: Mapping[str, Scalar]) -> Exported:
+        late = Late(0.5 * self.config.step_s)  # for the integrator's sake, as `DrivenWorld` does in the graph
+        return Exported(self._mjcf(values), late, partial(self._plain, values))
 
-    def identified_mjcf(self, values: Mapping[str, Scalar]) -> str | None:
+    def _mjcf(self, values: Mapping[str, Scalar]) -> str:
         """Return the file's model with the identified values: friction, inertia, payload, tilt, and each joint's drive.
 
         Where the log has gains of its own in N m/rad they are the command's, and the file's own actuators stay.
@@ -292,7 +294,7 @@ class MjcfRobot(LoggedRobot):
         copy_back(spec, model)
         return spec.to_xml()
 
-    def plain_simulation(self, values: Mapping[str, float]) -> PlainSimulation:
+    def _plain(self, values: Mapping[str, Scalar]) -> PlainSimulation:
         if "payload" in self.config.commands:
             raise UsageError(
                 "a model card reproduces logs without a payload, and these name one",

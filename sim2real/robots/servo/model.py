@@ -24,7 +24,7 @@ from sim2real.identification.model import PlainSimulation, converged
 from sim2real.identification.parameters import Parameter
 from sim2real.later import jnp
 from sim2real.robots.messages import EpisodeStart
-from sim2real.robots.robot import Embedded, RobotModel
+from sim2real.robots.robot import PAYLOAD, Embedded, Exported, RobotModel
 from sim2real.robots.servo.servos import DataSheet, Servos, name_of
 from sim2real.types import MjModel, MjSpec, PyTree, Scalar
 
@@ -32,12 +32,10 @@ if TYPE_CHECKING:
     from sim2real.emulation.bus import BusEmulation
     from sim2real.hardware.device import Following
     from sim2real.hardware.joint import Joint
-    from sim2real.robots.servo.world import ServoParams, ServoState, ServoWorld
+    from sim2real.robots.servo.world import ServoParams, ServoWorld
 
 mj: Any = mujoco
 
-PAYLOAD = "payload"
-"""Name of the parameter, and of its term."""
 OFFSET = "goal_offset"
 """Constant difference between a servo's position and its goal [rad]: of the zeros, or of worn gears."""
 _NAMES = ("gain", "damping", "armature", "friction")
@@ -101,7 +99,6 @@ class ServoModel(RobotModel):
     ) -> None:
         self.servos, self.mjcf, self.hand, self.causes = servos, mjcf, hand, causes
         self.step_s, self.tick_s, self.lead_s, self._dynamics = step_s, tick_s, 0.5 * step_s, dynamics
-        self.watched_terms = (PAYLOAD,) if hand else ()
 
     def dynamics(self) -> list[Parameter]:
         if self._dynamics is not None:
@@ -124,9 +121,6 @@ class ServoModel(RobotModel):
         qpos = jnp.asarray(model.qpos0, jnp.float32).at[qpos_at].set(position)
         qvel = jnp.zeros(model.nv, jnp.float32).at[qvel_at].set(velocity)
         return ServoParams(self.fields(values), qpos, qvel, self._stribeck(values))
-
-    def true_state(self, state: ServoState) -> PyTree:
-        return state.data.qpos, state.data.qvel, state.reference
 
     def fields(self, values: Mapping[str, Scalar]) -> dict[str, PyTree]:
         """Return the fields of the compiled model that parameters set: field -> array."""
@@ -160,16 +154,13 @@ class ServoModel(RobotModel):
         masses, centres = (jnp.asarray(x, jnp.float32) for x in (model.body_mass, model.body_ipos))
         return numbers | {"body_mass": masses.at[link].set(total), "body_ipos": centres.at[link].set(middle)}
 
-    @property
-    def late(self) -> Late:
+    def exported(self, values: Mapping[str, Scalar]) -> Exported:
         # MuJoCo adds half a step for its leapfrog, as in the graph, and half a step because it uses setpoints of a
         # step's end. In the graph a goal acts as its mean over a tick, so a profile starts up to a tick early.
-        return Late(self.step_s - 0.25 * self.tick_s, self.servos.sheet.profile_rad_s)
+        late = Late(self.step_s - 0.25 * self.tick_s, self.servos.sheet.profile_rad_s)
+        return Exported(converged(self._identified(values)), late, partial(self._plain, values))
 
-    def identified_mjcf(self, values: Mapping[str, Scalar]) -> str:
-        return converged(self._identified(values))
-
-    def plain_simulation(self, values: Mapping[str, float]) -> PlainSimulation:
+    def _plain(self, values: Mapping[str, Scalar]) -> PlainSimulation:
         s, model, (qpos_at, qvel_at) = self.servos, self.model, self._places
         profiles = [min(s.sheet.profile_rad_s / gear, _NEVER) for gear in s.gears]
         numbers = {"profile_rad_s": np.array(profiles)}
@@ -184,13 +175,13 @@ class ServoModel(RobotModel):
             return qpos, qvel
 
         lead: dict[str, Any] = {"lead_s": self.lead_s, "velocity_lead_s": self.lead_s}
-        mjcf = self.identified_mjcf(values)
+        mjcf = converged(self._identified(values))
         return PlainSimulation(mjcf, s.names, self.tick_s, begin, "setpoint", numbers, **lead)
 
     def following(self, values: Mapping[str, float]) -> Following:
         hand = self.hand
         loads = [{}] if hand is None else [{PAYLOAD: hand.least_kg}, {PAYLOAD: hand.most_kg}]
-        return identified_following([self.identified_mjcf({**values, **load}) for load in loads], self.servos.names)
+        return identified_following([self.exported({**values, **load}).mjcf for load in loads], self.servos.names)
 
     def twin(self, emulator: BusEmulation, **factors: float) -> Embedded:
         """Return an emulated robot with this model's physics.

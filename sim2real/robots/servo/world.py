@@ -161,6 +161,10 @@ class ServoWorld(BaseWorld):
         new = step_state.state.replace(data=data)
         return step_state.replace(state=new), self.message(None, data.qpos, data.qvel, data.qacc)
 
+    def true_state(self, state: ServoState) -> PyTree:
+        """Return the part of the state that a value function may observe."""
+        return state.data.qpos, state.data.qvel, state.reference
+
     def velocity(self, state: ServoState) -> jax.Array:
         """Return the joints' velocities ``(joints,)`` [rad/s]."""
         return state.velocity

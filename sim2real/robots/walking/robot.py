@@ -68,7 +68,7 @@ class ComposedRobot(Robot):
         joints = JointParameters(self.joints, self.groups or {"joint": range(len(self.joints))})
         self.model: WalkingModel = WalkingModel(self.make_task, joints, self.height_m, self.terrain)
         policy = self.commands, self.joints, stance, self.scale, self.history
-        self.task = WalkingTask(*policy, 1.0 / self.rate_hz, self.terms(), self.falls)
+        self.task = WalkingTask(*policy, 1.0 / self.drive.rate_hz, self.terms(), self.falls)
 
     @abstractmethod
     def terms(self) -> Mapping[str, Term]:
@@ -96,5 +96,5 @@ class ComposedRobot(Robot):
     def identifiable(self, max_delay_s: float) -> LegsInAStand:
         # The strengths of the motors take the place of a factor on all of them.
         fixed = [replace(p, free=False) for p in self.model.around() if p.name == STRENGTH]
-        loop = self.drive.channels, self.rate_hz, self.gains[1]
+        loop = self.drive.channels, self.drive.rate_hz, self.gains[1]
         return LegsInAStand(self.mjcf, self.model.joints, fixed, *loop, max_delay_s)

@@ -144,9 +144,9 @@ def walk(
         push_m_s: Size of a push every ``every_s`` [m/s].
         shown: Called after each policy step.
     """
-    robot, period_s = twin.robot, 1.0 / twin.robot.rate_hz
-    steps = round(seconds * robot.rate_hz)
-    node: Any = robot.task.make_agent(robot.rate_hz)
+    robot, period_s = twin.robot, 1.0 / twin.robot.drive.rate_hz
+    steps = round(seconds * robot.drive.rate_hz)
+    node: Any = robot.task.make_agent(robot.drive.rate_hz)
     node.commanded = lambda step_state: np.asarray(command(step_state.seq * period_s), np.float32)
     params = in_numpy(node.init_params())
     state = in_numpy(node.init_state(None, GraphState(params={AGENT: params})))
@@ -176,7 +176,7 @@ def walk(
         if twin.fallen():
             fell_s, velocity, wanted, qpos, settled = t_s, velocity[:i], wanted[:i], qpos[:i], settled[:i]
             break
-    window = np.ones(round(0.4 * robot.rate_hz)) / round(0.4 * robot.rate_hz)
+    window = np.ones(round(0.4 * robot.drive.rate_hz)) / round(0.4 * robot.drive.rate_hz)
     error = np.stack([np.convolve(velocity[:, k] - wanted[:, k], window, "same") for k in range(3)], axis=-1)
     error = error[settled] if settled.any() else np.full((1, 3), np.nan)  # too short to settle
     return Walked(fell_s, float(np.hypot(error[:, 0], error[:, 1]).mean()), float(np.abs(error[:, 2]).mean()), qpos)
@@ -230,7 +230,7 @@ def _episode(
     def shown(twin: Twin, t_s: float) -> None:
         told = {"aim": commanded(t_s), "command": twin.sent}
         columns = {f"{name}[{i}]": float(x) for name, values in told.items() for i, x in enumerate(values)}
-        times.append(t_s + 1.0 / robot.rate_hz)
+        times.append(t_s + 1.0 / robot.drive.rate_hz)
         rows.append({**twin.body.state(), **columns})
 
     policy.reset()

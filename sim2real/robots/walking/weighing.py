@@ -130,9 +130,10 @@ def balances_of(robot: ComposedRobot, episode: Episode, values: Mapping[str, flo
         raise OtherMotion("the robot does not stand upright in this log", hint="record it with --excitation standing")
     fastest = np.abs(speed[used]).max(axis=1)
     moving = (fastest > _MOVING_RAD_S) & (fastest < _FAST_RAD_S)
-    if moving.sum() < max(0.5 * len(used), _BEND_S * robot.rate_hz):
+    if moving.sum() < max(0.5 * len(used), _BEND_S * robot.drive.rate_hz):
+        slow_s = moving.sum() / robot.drive.rate_hz
         raise OtherMotion(
-            f"the legs move slowly for {moving.sum() / robot.rate_hz:.1f} s of this log, too short to weigh the robot",
+            f"the legs move slowly for {slow_s:.1f} s of this log, too short to weigh the robot",
             hint="record it on its feet with --excitation standing, which bends the legs",
         )
     used = used[moving][:: max(1, int(moving.sum()) // _MOST_SAMPLES)]

@@ -192,6 +192,7 @@ class WalkingWorld(ComposedWorld):
 
     def __init__(self, task: Ground, parameters: Mapping[str, tuple[Any, str]], **options: Any) -> None:
         super().__init__(WORLD, task, ACTUATOR, "q", parameters, **options)
+        self._rough = task.rough
         model = self.environment.model
         base = model.body(task.base.full_identifier).id
         kilograms = np.linspace(*LOADS_KG, _ROWS)
@@ -227,6 +228,14 @@ class WalkingWorld(ComposedWorld):
         data = state.data
         return BodyReading(data.qpos[self._qpos], data.qvel[self._qvel], data.qpos[3:7], data.qvel[3:6])
 
+    def true_state(self, state: State) -> PyTree:
+        """Return the part of the state that a value function may observe; heights are those above the ground."""
+        data, v = state.data, state.variables
+        position = data.qpos[2:]
+        if self._rough is not None:
+            position = position.at[0].add(-self._rough.at(data.qpos[:2]))
+        return position, data.qvel, data.actuator_force, v["air_s"], v["ground_s"], v["mean"]
+
     def velocity(self, state: State) -> jax.Array:
         """Return the velocities of the base: linear ``(3,)`` [m/s], then angular ``(3,)`` [rad/s]."""
         return state.data.qvel[:6]
@@ -256,8 +265,6 @@ class WalkingModel(RobotModel):
         make_task: Makes the composed task; True: on rough ground.
     """
 
-    needs_gpu = True
-
     def __init__(
         self,
         make_task: Callable[[bool], Ground],
@@ -280,9 +287,6 @@ class WalkingModel(RobotModel):
 
     def dynamics(self) -> list[Parameter]:
         return [*self.around(), *self.joints.dynamics()]
-
-    def unidentified(self) -> dict[str, float]:
-        return {p.name: p.nominal for p in self.around() if p.name != STRENGTH}
 
     def around(self) -> list[Parameter]:
         """Return the parameters that are of no joint: legs in the air determine none of them."""
@@ -339,13 +343,6 @@ class WalkingModel(RobotModel):
         base = jnp.array([x_m, 0.0, self._height_m + bumps_m, 1.0, 0.0, 0.0, 0.0], jnp.float32)
         position, velocity = (jnp.asarray(x, jnp.float32) for x in (start.position, start.velocity))
         return WorldParams(placed, jnp.concatenate([base, position]), jnp.concatenate([jnp.zeros(6), velocity]))
-
-    def true_state(self, state: PyTree) -> PyTree:
-        data, v = state.data, state.variables
-        position = data.qpos[2:]
-        if self.task.rough is not None:
-            position = position.at[0].add(-self.task.rough.at(data.qpos[:2]))
-        return position, data.qvel, data.actuator_force, v["air_s"], v["ground_s"], v["mean"]
 
     @cached_property
     def _world_params(self) -> WorldParams:

@@ -161,13 +161,13 @@ def _write_probe(log: Path, robot: Robot, witness: Witness) -> None:
     if not witness.measured or not witness.sent:
         return
     # Select the measurements and commands at the robot's rate; a command that changes is always selected.
-    period_ns, start_ns = round(1e9 / robot.rate_hz), min(witness.measured[0][0], witness.sent[0][0])
+    period_ns, start_ns = round(1e9 / robot.drive.rate_hz), min(witness.measured[0][0], witness.sent[0][0])
     measured = _apart([begin_ns for begin_ns, *_ in witness.measured], period_ns)
     changed = [i == 0 or not np.array_equal(goal, witness.sent[i - 1][2]) for i, (*_, goal) in enumerate(witness.sent)]
     sent = _apart([begin_ns for begin_ns, *_ in witness.sent], period_ns, changed)
     # Write them as steps of the sensor and the actuator.
     outputs = {SENSOR: robot.drive.at_rest, ACTUATOR: robot.drive.message(np.zeros(len(robot.task.action)))}
-    graph = {n: {"rate_hz": robot.rate_hz, "delay_s": 0.0, "inputs": {}} for n in outputs}
+    graph = {n: {"rate_hz": robot.drive.rate_hz, "delay_s": 0.0, "inputs": {}} for n in outputs}
     metadata = {"pipeline": robot.name, "dry_run": False, "graph": graph, "probe": True}
     joints, units = {SENSOR: joint_columns(robot.drive.channels)}, dict.fromkeys(outputs, robot.units)
     recorder = McapRecorder(log, metadata, {}, outputs, [], joints, units)

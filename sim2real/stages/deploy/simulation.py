@@ -169,7 +169,7 @@ def simulate(
 
     # Draw the timelines from the robot's timing. An error must not lose the deployment.
     try:
-        computation, hiccups = timing.computation(1.0 / robot.rate_hz)
+        computation, hiccups = timing.computation(1.0 / robot.drive.rate_hz)
     except Sim2RealError as error:
         note(f"warning: nothing to compare with: {error.args[0]}")
         return []

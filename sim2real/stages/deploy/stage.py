@@ -246,8 +246,8 @@ def require_fit(robot: Robot, bundle: Bundle, config: DeployConfig) -> None:
     rows: list[tuple[str, str]] = []
     for (verb, trained), here in zip(terms(contract).items(), terms(task).values(), strict=True):
         rows += [(f"{verb} {trained}", f"has {here}")] if trained != here else []
-    if contract.rate_hz != robot.rate_hz:
-        rows.append((f"runs at {contract.rate_hz:g} Hz", f"at {robot.rate_hz:g} Hz"))
+    if contract.rate_hz != robot.drive.rate_hz:
+        rows.append((f"runs at {contract.rate_hz:g} Hz", f"at {robot.drive.rate_hz:g} Hz"))
     for trained, term in zip(contract.observation, task.observation, strict=False):
         bounds = [trained.low, trained.high], [term.low, term.high]
         if not rows and trained.low and term.low and not np.allclose(*bounds, rtol=1e-6):

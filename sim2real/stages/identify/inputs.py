@@ -59,7 +59,8 @@ class Inputs:
     @property
     def undetermined(self) -> tuple[str, ...]:
         """Parameters of training that no log of the robot determines."""
-        return tuple(self.robot.model.unidentified()) if isinstance(self.robot, Robot) else ()
+        known = self.robot.nominal() if isinstance(self.robot, Robot) else ()
+        return tuple(name for name in known if name not in self.model.parameters.names)
 
     def sources(self, run_dir: Path | None = None) -> tuple[Source, ...]:
         """Return the logs with their hashes from before the fit.

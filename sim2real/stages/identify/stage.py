@@ -134,8 +134,8 @@ def _write(identification: Identification, stage: OpenStage, robot: RecordedRobo
     """Write the artifact, and the model as MJCF."""
     for name, path in identification.save(stage.folder).items():
         stage.output(name, path)
-    if (mjcf := robot.simulated.identified_mjcf(identification.values)) is not None:
-        stage.output("mjcf", "identified.xml").write_text(mjcf, encoding="utf-8")
+    if (exported := robot.exported(identification.values)) is not None:
+        stage.output("mjcf", "identified.xml").write_text(exported.mjcf, encoding="utf-8")
 
 
 def show(identification: Identification) -> None:

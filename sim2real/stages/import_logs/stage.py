@@ -101,7 +101,7 @@ def hints_of(config: ImportConfig) -> ImportHints:
     robot: Any = load_robot(config.pipeline)
     if isinstance(robot, MjcfRobot):
         return hints_of_model(robot.config.model, config.pipeline, robot.config.joints, config.rate_hz, **more)
-    channels = getattr(robot, "sensor", robot).channels  # a recorded robot has no sensor
+    channels = getattr(robot, "drive", robot).channels  # a recorded robot has no drive
     joints = tuple(c.label for c in channels)
     return ImportHints(config.pipeline, config.rate_hz, config.joints or joints, **more)
 

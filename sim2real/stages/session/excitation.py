@@ -40,21 +40,21 @@ def played(config: RecordConfig, robot: Robot, announce: bool = False) -> np.nda
     if config.standing:
         if robot.drive.crouch is None:
             raise UsageError("this robot does not stand on legs", hint="choose another --excitation")
-        return bent_legs(robot.drive.crouch, config.duration_s, robot.rate_hz)
+        return bent_legs(robot.drive.crouch, config.duration_s, robot.drive.rate_hz)
     if config.motion is None:
-        return excitation(config, robot.rate_hz, commands).reshape(-1, commands)
+        return excitation(config, robot.drive.rate_hz, commands).reshape(-1, commands)
     # The names of the robot's commands: its joints, otherwise their numbers.
     names = robot.drive.gate(config.gate).joints
     if len(names) != commands:
         names = tuple(f"{robot.drive.command}[{i}]" for i in range(commands))
     t_s, motion, source = _read_motion(config.motion, robot, names)
-    steps_s = np.arange(0.0, min(t_s[-1], config.duration_s), 1.0 / robot.rate_hz)
+    steps_s = np.arange(0.0, min(t_s[-1], config.duration_s), 1.0 / robot.drive.rate_hz)
     sampled = np.stack([np.interp(steps_s, t_s, column) for column in motion.T], axis=1)
     rows = _within(sampled, config, robot, names)
     if announce:
-        skipped_s = min(t_s[-1], config.duration_s) - len(rows) / robot.rate_hz
-        note(f"motion: {source}, {len(rows) / robot.rate_hz:.1f} s")
-        if skipped_s > 2.0 / robot.rate_hz:
+        skipped_s = min(t_s[-1], config.duration_s) - len(rows) / robot.drive.rate_hz
+        note(f"motion: {source}, {len(rows) / robot.drive.rate_hz:.1f} s")
+        if skipped_s > 2.0 / robot.drive.rate_hz:
             note(f"motion: {skipped_s:.1f} s at its ends are outside of the limits, and are not played")
     return rows - robot.drive.centre
 
@@ -121,7 +121,7 @@ def _within(rows: np.ndarray, config: RecordConfig, robot: Robot, names: Sequenc
     Raises:
         UsageError: It leaves the limits in between, or is too fast; the robot has not moved.
     """
-    gate, unit, rate_hz = robot.drive.gate(config.gate), robot.units[robot.drive.command], robot.rate_hz
+    gate, unit, rate_hz = robot.drive.gate(config.gate), robot.units[robot.drive.command], robot.drive.rate_hz
     low, high = (np.broadcast_to(np.asarray(end, np.float64), rows.shape[1]) for end in gate.range)
     beyond = np.maximum(low - rows, rows - high) - _ROUNDED
 

@@ -44,7 +44,7 @@ def record(robot: AnyRobot, folder: AnyPath, config: RecordConfig | Mapping[str,
     config = config_of(config, defaults_of(robot).record)
     log, truth = folder / LOG, folder / TRUTH
     signal = None if config.by_hand else _planned(config, robot)
-    duration_s = config.duration_s if signal is None else len(signal) / robot.rate_hz
+    duration_s = config.duration_s if signal is None else len(signal) / robot.drive.rate_hz
     note(f"recording {duration_s:g} s of {config.excitation} on {config.port}")
     with live_view(config.view, folder, robot.name, partial(scene_of, robot)), opened(robot, config, truth) as bench:
         if signal is None:

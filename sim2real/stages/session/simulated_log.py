@@ -39,7 +39,7 @@ def simulate(
     # Draw a timeline, and play the signal on it.
     nodes = model.nodes(config.max_delay_s)
     engine = choose_engine(config.engine, nodes, model.given)
-    timeline = draw(nodes, len(signal) / robot.rate_hz, rng=seed)
+    timeline = draw(nodes, len(signal) / robot.drive.rate_hz, rng=seed)
     commands, outputs = {}, {}
     for name in model.given:
         message = nodes[name].init_output(jax.random.key(0), None)

@@ -22,6 +22,7 @@ from sim2real.graph.episode import Episode
 from sim2real.identification.model import IdentifiableModel, position_of
 from sim2real.identification.parameters import ParameterTable
 from sim2real.identification.segments import GRID_S, Span, on_grid
+from sim2real.robots.identified import LoggedRobot
 from sim2real.robots.robot import RecordedRobot, in_world
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.load import defaults_of
@@ -67,7 +68,9 @@ def offering(robot: RecordedRobot, wanted: str) -> RecordedRobot:
     Args:
         wanted: As in ``with_wanted_terms``.
     """
-    return robot if wanted in ("own", "none") else robot.with_optional_terms(wanted)
+    if not isinstance(robot, LoggedRobot) or wanted in ("own", "none"):
+        return robot
+    return robot.with_optional_terms(wanted)
 
 
 def identified_robot(identification: Identification, robot: RecordedRobot) -> tuple[RecordedRobot, IdentifyConfig]:

@@ -106,7 +106,7 @@ def contract_of(
             replace(term, low=float(low), high=float(high))
             for term, low, high in zip(robot.task.action, task.action_low, task.action_high, strict=True)
         ),
-        rate_hz=robot.rate_hz,
+        rate_hz=robot.drive.rate_hz,
         delays_s={n: v for n, v in values.items() if n.endswith("_delay")},
         trained_s=trained,
         limits=dict(robot.task.limits),
@@ -124,7 +124,7 @@ def has_readings(robot: Robot, recording: Recording) -> bool:
 
 def _observations(robot: Robot, recording: Recording, runner: PolicyRunner) -> np.ndarray:
     """Return the observations ``(N, O)`` that a policy would get from a recording's measurements."""
-    agent: Any = robot.task.make_agent(robot.rate_hz)
+    agent: Any = robot.task.make_agent(robot.drive.rate_hz)
     if not (hasattr(agent, "observe") and hasattr(agent, "act")):
         raise Sim2RealError(f"a {type(agent).__name__} has no `observe` and `act`, which a policy needs")
 

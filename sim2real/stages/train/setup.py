@@ -75,7 +75,7 @@ def prepare(
     # Draw parameters and delays.
     has_posterior = identification is not None and identification.posterior is not None
     identified = identification.values if identification and has_posterior else None
-    usual_values = robot.nominal() if identified is None else robot.model.unidentified() | identified
+    usual_values = robot.nominal() | (identified or {})
     # A data sheet has no delays: ranges of both give the loop delays.
     ranged = {n: sum(config.vary.range[n]) / 2 for n in DELAYS if n in config.vary.range and n not in usual_values}
     values = _replaced(usual_values, {**ranged, **(changed or {})})
@@ -89,7 +89,7 @@ def prepare(
     recorded = None
     if identification is not None:
         timing = timing or timing_of(identification)
-        recorded = RecordedTiming.of(timing, robot.rate_hz, config.seed, config.vary.pauses)
+        recorded = RecordedTiming.of(timing, robot.drive.rate_hz, config.seed, config.vary.pauses)
     delayed = recorded is not None or set(DELAYS) <= set(values)
     nodes, task = training_loop(robot, values, draws, recorded.computation if recorded else {}, delayed, spread_s)
     if recorded:
@@ -104,7 +104,7 @@ def prepare(
     if any(start := (config.vary.start_position, config.vary.start_velocity)):
         task.start = start
         jax.eval_shape(task.params, jax.random.key(0))
-    pushes = Pushes.of(config.vary, nodes[WORLD], robot.rate_hz)
+    pushes = Pushes.of(config.vary, nodes[WORLD], robot.drive.rate_hz)
     curriculum = config.vary.curriculum if config.vary.grows else None
     env = GraphEnvironment(graph, task, drawn.steps, pushes, curriculum, config.vary.follow)
     episodes = _episodes(identification, values, draws, noise, drawn, timing, config)

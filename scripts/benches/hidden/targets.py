@@ -5,7 +5,10 @@ Both move the goals as fast as the servos can follow: at the speed of a reaching
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +27,15 @@ CLOSE_M = 0.01
 """How near the tip must be to its target [m]."""
 SETTLED_S = 1.0
 """Time in which the tip comes to the figure, which does not count [s]."""
+FAST_RAD_S = {"arm": 5.0, "so101": 4.0}
+"""Largest speed of the goals, where time counts [rad/s]: that of the profile, and near that of a servo without load."""
+CENTRES = {
+    "arm": ((-0.5, 0.3, 1.0), (0.5, 0.6, 1.3)),
+    "so101": ((-0.5, -1.1, 0.8, -1.4, 0.0, 0.0), (0.5, -0.7, 1.1, -1.2, 0.0, 0.0)),
+}
+"""Joint angles between which the centres of figures are drawn [rad]: all points of a figure must be within reach."""
+STILL = {"arm": (), "so101": (4, 5)}
+"""Joints that do not move the tip, and shall stay at 0."""
 _TARGET = tuple((f"target {axis}", "m") for axis in "xyz")
 _AHEAD = tuple((f"target {axis}, {AHEAD_S:g} s ahead", "m") for axis in "xyz")
 _AXES = "outwards, sideways, up"
@@ -42,14 +54,26 @@ def figure_of_eight(numbers: Array, t_s: Scalar) -> Array:
     return xp.stack([numbers[0] - sideways * numbers[1], numbers[1] + sideways * numbers[0], numbers[2] + up])
 
 
+def tasked(robot: Any, task: str) -> Any:
+    """Return an arm with the task ``follow``, the tip on a figure of eight, or ``fast``, the tip soon at a target."""
+    from sim2real.stages.load import load_module
+
+    module, name = load_module(robot.name, "robot"), robot.name
+    servos = replace(robot.drive.servos, speed=FAST_RAD_S[name])
+    ends = (module.LOW, module.HIGH), CENTRES[name]
+    changed = copy.copy(robot)
+    changed.task = target_tasks(servos, module.tip_of, module.way, *ends, robot.drive.rate_hz, STILL[name])[task]
+    return changed
+
+
 def target_tasks(
     servos: Servos,
     tip_of: Callable[[Array], Array],
     way: Callable[[Array, Array], Array],
     targets: tuple[tuple[float, ...], tuple[float, ...]],
     centres: tuple[tuple[float, ...], tuple[float, ...]],
-    rate_hz: float = 50.0,
-    still: tuple[int, ...] = (),
+    rate_hz: float,
+    still: tuple[int, ...],
 ) -> dict[str, AimTask]:
     """Return the tasks ``follow``, the tip on a figure of eight, and ``fast``, the tip soon at a target.
 
