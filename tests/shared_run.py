@@ -40,7 +40,7 @@ ROBOT = replace(hidden.Hidden.draw(1), jitter=0.0, lost=0.0, play=0.0)
 NODES = {"sensor": None, "agent": "sensor", "actuator": "agent"}
 EPOCH_NS = 1_790_000_000_000_000_000
 SUMMARY = {
-    "transactions": 1200, "lost_replies": 0, "late_replies": 0, "late_s": [0.0] * 3,
+    "transactions": 1200, "lost_replies": 0, "late_replies": 0,
     "command_timeouts": 0, "monotonic_ns": 0,
 }  # fmt: skip
 
@@ -101,10 +101,7 @@ def write(log: Path, truth: Path, played: hidden.Played) -> dict[str, Any]:
             recorder.step(StepRecord(node, k, start, start, start, -1, int(ends[node][k]), 0), outputs[node][k])
             if sender:
                 recorder.message(MessageRecord(node, sender, k, k, start, start))
-    quantiles = {"period_s": [1 / hidden.RATE_HZ] * 3, "lateness_s": [0.0] * 3, "overruns": 0}
-    timing = {
-        n: {"steps": len(played.volts), **quantiles, "age_s": {s: [0.0] * 3} if s else {}} for n, s in NODES.items()
-    }
+    timing = {n: {"steps": len(played.volts), "overruns": 0} for n in NODES}
     summary = {**SUMMARY, "timing": timing}
     recorder.close("finished", 0, summary)
     write_truth(truth, played, 1000 * starts["sensor"], 1000 * starts["actuator"], 1000 * ends["actuator"])

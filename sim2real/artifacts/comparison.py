@@ -101,5 +101,5 @@ def _figures_of(run: ComparedRun) -> dict[str, Json]:
             figures["deployment"] = deployment.verdict.status
         figures["episodes"] = len(deployment.episodes)
         for gap in deployment.gap:
-            figures[f"{gap.quantity} [{gap.unit}]" if gap.unit else gap.quantity] = gap.real
+            figures[gap.quantity] = gap.real
     return figures

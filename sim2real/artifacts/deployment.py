@@ -19,10 +19,10 @@ from sim2real.artifacts.files import (
     write_arrays,
     write_json,
 )
+from sim2real.artifacts.identification import ComparedError
 from sim2real.artifacts.paths import shown
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.summary import ArtifactTable, Interval, Shown, words_and_unit
-from sim2real.log.schema import unit_of
 from sim2real.types import Json
 
 FORMAT = 5
@@ -58,12 +58,11 @@ class EpisodeRow:
 
 @dataclass(frozen=True)
 class Gap:
-    """One quantity on the robot, and in simulation or in training."""
+    """One quantity on the robot, and in simulation or in training; its name ends with its unit."""
 
     quantity: str
     real: float | None
     simulation: float | None
-    unit: str = ""
 
     @property
     def gap(self) -> float | None:
@@ -72,32 +71,6 @@ class Gap:
 
 
 # -- the tests of the model
-
-
-@dataclass(frozen=True)
-class Replay:
-    """Prediction errors of models that receive the recorded commands, for one measured position.
-
-    Attributes:
-        name: The position's name in tables.
-        horizon_s: Time between the last fitted sample and the prediction [s].
-        rmse: Model -> root mean square error; None if the model diverged. ``as in this log`` is fitted to this log.
-        expected: Expected error of the identified model, scaled up if this log moves more; None if unknown.
-        column: The position's name among the columns.
-    """
-
-    name: str
-    unit: str
-    horizon_s: float
-    rmse: Mapping[str, float | None]
-    expected: float | None = None
-    column: str = ""
-
-    def error(self, model: str) -> str:
-        """Return a model's error beside the expected one, as a text."""
-        error = self.rmse.get(model)
-        size = "it diverges" if error is None else f"off by {error:.2g} {self.unit}"
-        return f"{size} {self.horizon_s:g} s ahead, expected were {self.expected or 0.0:.2g} {self.unit}"
 
 
 _MIN_SHARE = 0.5
@@ -240,8 +213,10 @@ class Deployment(Shown):
     """Episodes on the robot, and the same policy in simulation.
 
     Attributes:
+        measured_delay: The delay before the episodes, as a text; "" if it was not measured.
         times: Times on the robot, and the times that the policy was trained with.
-        replay: Prediction errors of the identified and of the nominal model on the recorded commands.
+        replay: Error of the identified model on the recorded commands, for each measured position; beside it those of
+            the nominal model, and of the model with the parameters fitted to these logs, ``AS_HERE``.
         drift: Test for parameters that have changed since the identification; None if it did not run.
         untested: Why the model is not tested on these logs; None if it is.
         verdict: None after a dry run.
@@ -249,13 +224,12 @@ class Deployment(Shown):
         simulated: Columns of each episode's simulation: ``t`` [s] and a field's values ``(N,)``; a field with its own
             times has them as ``t_FIELD``. Empty without a simulation.
         probe: Log of the small steps that measure the delay; None if the delay was not measured.
-        summary: Summary of each episode's session; empty for a loaded artifact.
     """
 
     episodes: tuple[EpisodeRow, ...]
-    units: Mapping[str, str] = field(default_factory=dict)
+    measured_delay: str = ""
     times: tuple[Gap, ...] = ()
-    replay: tuple[Replay, ...] = ()
+    replay: tuple[ComparedError, ...] = ()
     drift: Drift | None = None
     untested: Reason | None = None
     verdict: Verdict | None = None
@@ -264,7 +238,6 @@ class Deployment(Shown):
     simulated: tuple[Mapping[str, np.ndarray], ...] = ()
     recordings: tuple[Recording, ...] = ()
     probe: Recording | None = None
-    summary: tuple[Mapping[str, Json], ...] = ()
 
     def __post_init__(self) -> None:
         check(bool(self.episodes), "no episode")
@@ -320,8 +293,8 @@ class Deployment(Shown):
                 most_s = max(e.paused_s for e in self.episodes)
                 return f"an episode lost {most_s:.2g} s to pauses of its nodes, and no simulation has such pauses"
             case Finding.UNEXPLAINED:
-                error = f": {joint.error(AS_HERE)}" if joint else ""
-                return f"no parameters explain how {about} moves{error}; it may be loose, blocked, or touch something"
+                fitted = "" if joint is None else f", fitted to these logs {as_here(joint)}"
+                return f"no parameters explain how {about} moves{fitted}; it may be loose, blocked, or touch something"
             case Finding.CHANGED:
                 others = [name for name in self.drift.alarms if name != about] if self.drift else []
                 less = f"; less likely, each alone: {', '.join(others)}" if others else ""
@@ -329,7 +302,7 @@ class Deployment(Shown):
             case Finding.LIKELY:
                 return f"most likely the robot has changed: {changed}"
             case Finding.WRONG:
-                return f"{about}: {joint.error('identified')}" if joint else about
+                return about if joint is None else str(joint)
             case Finding.HOLDS:
                 return "the model holds"
             case Finding.NO_MODEL:
@@ -341,18 +314,11 @@ class Deployment(Shown):
 
     def rows(self) -> ArtifactTable:
         """Return the gap: a row for each score."""
-        return _gap_table(("quantity", "robot", "simulation", "gap", "unit"), self.gap, self.units)
+        return _gap_table(("quantity", "robot", "simulation", "gap", "unit"), self.gap)
 
     def times_table(self) -> ArtifactTable:
         """Return the times on the robot and in training: a row for each."""
-        return _gap_table(("times", "robot", "in training", "gap", "unit"), self.times, {})
-
-    def replay_table(self) -> ArtifactTable:
-        """Return the prediction errors of each model on the recorded commands: a row for each position."""
-        models = list(self.replay[0].rmse) if self.replay else []
-        horizon = f"commands played again, RMSE {self.replay[0].horizon_s:g} s ahead" if self.replay else ""
-        rows = [[r.name, *(r.rmse.get(m) for m in models), r.expected, r.unit] for r in self.replay]
-        return ArtifactTable((horizon, *models, "expected", "unit"), rows)
+        return _gap_table(("times", "robot", "in training", "gap", "unit"), self.times)
 
     # The files.
 
@@ -364,7 +330,7 @@ class Deployment(Shown):
         """
         folder = make_folder(folder)
         document = self._next_with(shown(folder.parent), _RUN)
-        write_json(folder / RESULT, document, without=("simulated", "recordings", "probe", "summary"))
+        write_json(folder / RESULT, document, without=("simulated", "recordings", "probe"))
         if self.dry_run:
             return {"result": RESULT}
         columns = {f"{i}/{n}": v for i, episode in enumerate(self.simulated) for n, v in episode.items()}
@@ -408,19 +374,21 @@ class Deployment(Shown):
         return replace(deployment, simulated=tuple(simulated), recordings=recordings, probe=probe)
 
 
+def as_here(row: ComparedError) -> ComparedError:
+    """Return the error of the model whose parameters are fitted to the deployment's own logs."""
+    return replace(row, error=row.baselines.get(AS_HERE))
+
+
 def mean(values: Sequence[float | None]) -> float | None:
     """Return the mean of the values that exist; None if none does."""
     present = [v for v in values if v is not None]
     return float(np.mean(present)) if present else None
 
 
-def _gap_table(headers: Sequence[str], gaps: Sequence[Gap], units: Mapping[str, str]) -> ArtifactTable:
-    """Return a row for each quantity; its unit is the gap's, the field's, or the end of its name."""
-    rows = []
-    for gap in gaps:
-        words, unit = words_and_unit(gap.quantity)
-        unit = gap.unit or unit_of(gap.quantity, units) or unit
-        rows.append([words, gap.real, gap.simulation, gap.gap, unit])
+def _gap_table(headers: Sequence[str], gaps: Sequence[Gap]) -> ArtifactTable:
+    """Return a row for each quantity; the end of its name is its unit."""
+    words = [words_and_unit(gap.quantity) for gap in gaps]
+    rows = [[name, g.real, g.simulation, g.gap, unit] for g, (name, unit) in zip(gaps, words, strict=True)]
     return ArtifactTable(headers, rows)
 
 

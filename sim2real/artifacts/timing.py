@@ -149,7 +149,7 @@ class Timing(Shown):
             took = (t.computation.p50, t.computation.p99, t.computation.max)
             times = (t.period.p50, t.lateness.p99, t.lateness.max, *took, t.bus.p50, t.bus.max, oldest)
             rows.append([name, t.steps, *map(in_ms, times), t.overruns])
-        heads = ("period", "late p99", "late max", "computation", "comp. p99", "comp. max", "bus p50", "bus max")
+        heads = ("period [ms]", "late p99", "late max", "computation", "comp. p99", "comp. max", "bus p50", "bus max")
         return ArtifactTable(("node", "steps", *heads, "oldest input", "overruns"), rows)
 
     def save(self, folder: Path | str, name: str = "timing") -> dict[str, str]:

@@ -82,7 +82,7 @@ def tabs_of(artifacts: Mapping[str, StageFolder]) -> list[Tab]:
         deployed = Deployment.load(artifacts["deploy"].folder)
         for i, (recording, simulated) in enumerate(zip(deployed.recordings, deployed.simulated, strict=True)):
             log = signals_of(recording)
-            beside = simulated_beside(simulated, log, deployed.units)
+            beside = simulated_beside(simulated, log)
             tabs.append(episode_tab(_dry(f"Deploy {i}", log), f"deploy/{i}", log, beside))
     return [tab for tab in tabs if tab.plots]
 

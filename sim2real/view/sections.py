@@ -11,7 +11,7 @@ from matplotlib.ticker import FuncFormatter
 from sim2real.artifacts.bundle import GOOD_SUCCESS, History
 from sim2real.artifacts.deployment import Deployment, EpisodeRow
 from sim2real.artifacts.episodes import Episodes
-from sim2real.artifacts.identification import Identification, with_small_unit, worst_window
+from sim2real.artifacts.identification import Identification, compared_table, with_small_unit, worst_window
 from sim2real.artifacts.iterations import iterations, iterations_table
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run import StageFolder, finished
@@ -241,10 +241,10 @@ def deploy_section(artifact: StageFolder) -> PageSection:
     logs = [signals_of(recording) for recording in deployed.recordings]
     blocks: list[Block] = [NoteBlock(text) for log in logs for text in log.warnings]
     # Draw each episode beside its simulation.
-    units = {**logs[0].units, **deployed.units}
+    units = logs[0].units
     joints = {row.column: row.name for row in deployed.replay}
     episodes = [
-        pairs_of(log, simulated_beside(columns, log, units), units, joints)
+        pairs_of(log, simulated_beside(columns, log), joints)
         for log, columns in zip(logs, deployed.simulated, strict=True)
     ]
     for index, pairs in enumerate(episodes):
@@ -375,10 +375,10 @@ def _deploy_tables(deployed: Deployment) -> list[Block]:
         blocks.append(TableBlock.of(caption, deployed.drift.rows()))
     if deployed.replay:
         caption = (
-            "The recorded commands, played again on models: root mean square error of each model's prediction "
-            f"{deployed.replay[0].horizon_s:g} s ahead, and the expected error of the identification."
+            "The recorded commands, played again on models: root mean square error of each model's prediction, and the "
+            "expected error of the identification."
         )
-        blocks.append(TableBlock.of(caption, deployed.replay_table()))
+        blocks.append(TableBlock.of(caption, compared_table(deployed.replay, "log")))
     if deployed.times:
         caption = "Times on the robot, and the times that the policy was trained with"
         blocks.append(TableBlock.of(caption, deployed.times_table()))

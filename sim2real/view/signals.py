@@ -140,14 +140,12 @@ def simulated_series(columns: Mapping[str, np.ndarray]) -> list[Series]:
     return series
 
 
-def simulated_beside(columns: Mapping[str, np.ndarray], log: Signals, units: Mapping[str, str]) -> list[Series]:
+def simulated_beside(columns: Mapping[str, np.ndarray], log: Signals) -> list[Series]:
     """Return the series of a simulated episode, with angles shifted by whole turns to the robot's first angle.
 
     Args:
         columns: See ``simulated_series``.
-        units: Field -> unit, beside those of the log.
     """
-    units = {**log.units, **units}
     real, last = {s.name: s for s in log.measured}, log.last_command()
     real |= {f"command[{i}]": s for i, s in enumerate(last)}
     real |= {"command": last[0]} if len(last) == 1 else {}
@@ -155,28 +153,23 @@ def simulated_beside(columns: Mapping[str, np.ndarray], log: Signals, units: Map
     for series in simulated_series(columns):
         robot = real.get(series.name)
         turns = 0.0
-        if robot is not None and unit_of(robot.name, units) == "rad" and len(robot.values) and len(series.values):
+        if robot is not None and unit_of(robot.name, log.units) == "rad" and len(robot.values) and len(series.values):
             turns = np.round((robot.values[0] - series.values[0]) / (2 * np.pi))
         shifted.append(replace(series, values=series.values + 2 * np.pi * turns) if np.isfinite(turns) else series)
     return shifted
 
 
-def pairs_of(
-    log: Signals, simulation: Sequence[Series], units: Mapping[str, str], joints: Mapping[str, str]
-) -> list[ComparedSeries]:
+def pairs_of(log: Signals, simulation: Sequence[Series], joints: Mapping[str, str]) -> list[ComparedSeries]:
     """Return each measurement and each command to the motors with its simulation.
 
     Args:
         simulation: Result of ``simulated_beside``; empty without a simulation.
-        units: Field -> unit.
         joints: Column of a position -> name of its joint, for labels; other columns have their own name.
     """
     by_name = {s.name: s for s in simulation}
     commands = [s for s in simulation if s.name.partition("[")[0] == "command"]
     pairs = [
-        ComparedSeries(
-            joints.get(s.name, s.name), s, by_name.get(s.name), angle=unit_of(s.name, {**log.units, **units}) == "rad"
-        )
+        ComparedSeries(joints.get(s.name, s.name), s, by_name.get(s.name), angle=unit_of(s.name, log.units) == "rad")
         for s in log.measured
     ]
     for index, series in enumerate(log.last_command()):

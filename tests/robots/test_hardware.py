@@ -67,19 +67,20 @@ def episodes(arm, tmp_path_factory):
         config = Config()
         robot.drive.prepare(rig, 5.0)
         nodes = recording_nodes(robot, rig, SIGNAL)
-        recorded = Bench(robot, rig, config).run_episode(nodes, {}, logs[0], 1.0, "record")
+        Bench(robot, rig, config).run_episode(nodes, {}, logs[0], 1.0, "record")
         robot.drive.prepare(rig, 10.0)
         nodes, params = deployment_nodes(robot, rig, policy, trial=2)
-        deployed = Bench(robot, rig, config).run_episode(nodes, params, logs[1], 0.6, "deploy")
+        Bench(robot, rig, config).run_episode(nodes, params, logs[1], 0.6, "deploy")
         left = rig.wait_until_still(5.0).position_rad
         robot.drive.prepare(rig, 10.0)
         brought = rig.measure().position_rad
+    recorded, deployed = map(read_log, logs)
     return SimpleNamespace(
         robot=robot,
         range=range_,
-        recorded=read_log(logs[0]),
-        deployed=read_log(logs[1]),
-        summaries=(recorded, deployed),
+        recorded=recorded,
+        deployed=deployed,
+        summaries=[log.metadata["log"]["session_end"] for log in (recorded, deployed)],
         params=params,
         left_at=left,
         brought_to=brought,

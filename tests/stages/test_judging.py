@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sim2real.artifacts.deployment import Changed, Deployment, Drift, EpisodeRow, Finding, Reason, Replay, Verdict
-from sim2real.artifacts.identification import Noise
+from sim2real.artifacts.deployment import AS_HERE, Changed, Deployment, Drift, EpisodeRow, Finding, Reason, Verdict
+from sim2real.artifacts.identification import AHEAD, ComparedError, Noise
 from sim2real.artifacts.recording import Recording
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode, Steps
@@ -35,7 +35,8 @@ def episode(seconds=10.0, took_s=0.001):
 
 def deployed(identified=0.01, here=0.01, success=1.0, simulated=1.0, drift=STEADY, took_s=0.001, seconds=10.0):
     """A deployment: how far models are off, how well it went, what has changed, and how long steps took."""
-    rows = (Replay("hinge", "rad", 0.1, {"identified": identified, verdict.AS_HERE: here, "hold": 0.5}, 0.01),)
+    models = {"baselines": {AS_HERE: here, "hold": 0.5}, "expected": 0.01}
+    rows = (ComparedError("this deployment", "th", "hinge", "rad", AHEAD, 0.1, identified, **models),)
     logs = tuple(Recording(Path(f"runs/pendulum/T/deploy/episode_{i}.mcap"), episode(seconds, took_s)) for i in (0, 1))
     real, late = {"success": success}, [simulation.late_shares(log, BUNDLE) for log in logs]
     table = tuple(EpisodeRow(real, {"success": simulated}, shares) for shares in late)
@@ -50,9 +51,9 @@ def deployed(identified=0.01, here=0.01, success=1.0, simulated=1.0, drift=STEAD
         ({"drift": ALARM, "success": 0.7}, "re-identify", "friction is 12 rad/s^2"),
         ({"drift": ALARM}, "fine", "success is 1.00"),
         ({"identified": 0.012}, "fine", "success is 1.00"),
-        ({"identified": 0.013}, "re-identify", "expected were 0.01 rad"),
-        ({"identified": 0.04}, "re-identify", "expected were 0.01 rad"),
-        ({"identified": None}, "re-identify", "it diverges"),
+        ({"identified": 0.013}, "re-identify", "10 mrad were expected"),
+        ({"identified": 0.04}, "re-identify", "10 mrad were expected"),
+        ({"identified": None}, "re-identify", "hinge diverges"),
         ({"took_s": 0.0025}, "fine", "success is 1.00"),
         ({"success": None}, "fine", "no success"),
         ({"took_s": 0.004}, "fine", "success is 1.00"),

@@ -42,7 +42,7 @@ def calls(artifacts, found, log):
     """Every figure there is, as a function and its arguments, by name."""
     deployed = Deployment.load(artifacts["deploy"].folder)
     episode, simulation = signals_of(deployed.recordings[1]), simulated_series(deployed.simulated[1])
-    pairs = pairs_of(episode, simulation, deployed.units, {})
+    pairs = pairs_of(episode, simulation, {})
     training = History.load(artifacts["train"].folder)
     return {
         "record": (sections.recording_svg, log),

@@ -24,7 +24,6 @@ def test_positions_have_the_names_of_their_joints_and_keep_their_simulation():
     pairs = pairs_of(
         Signals(Episode({}, {}, {}, {"graph": {}}), measured, [], {}),
         simulation,
-        {"position": "rad"},
         {"position[1]": "elbow"},
     )
     assert [pair.label for pair in pairs] == ["position[0]", "elbow", "velocity[0]"]
@@ -54,5 +53,5 @@ def test_angles_of_a_simulation_are_drawn_on_the_robots_turn(name, unit, real, s
     measured, commanded = ([], [robot]) if name == "command" else ([robot], [])
     log = Signals(episode, measured, commanded, {}, {robot.name.partition("[")[0]: unit})
     values = simulated - t_s
-    (found,) = simulated_beside({"t": t_s, name: values}, log, {})
+    (found,) = simulated_beside({"t": t_s, name: values}, log)
     np.testing.assert_allclose(found.values, values + 2 * np.pi * turns)

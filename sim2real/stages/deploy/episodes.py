@@ -25,7 +25,6 @@ from sim2real.stages.deploy.config import DeployConfig
 from sim2real.stages.live import live_view, scene_of
 from sim2real.stages.session.episode import Bench, opened
 from sim2real.stages.terminal.console import note
-from sim2real.types import Json
 
 
 def run_episodes(
@@ -34,8 +33,8 @@ def run_episodes(
     config: DeployConfig,
     logs: Sequence[Path],
     following: Following | None = None,
-) -> list[dict[str, Json]]:
-    """Run the policy for one episode a log; return the summary of each session.
+) -> str:
+    """Run the policy for one episode a log; return the measured delay as a text, "" if it is not measured.
 
     Args:
         logs: The files to write, all in the folder of the deployment.
@@ -57,8 +56,9 @@ def run_episodes(
         _announce_following(bench.rig.following)
         # Measure the delay before the policy moves the robot: a policy trained for another delay may oscillate.
         delay = _measure_delay(bench, bundle.contract, folder)
-        summaries = [_run_one(bench, policy, i, log) for i, log in enumerate(logs)]
-    return [{**summary, **delay} for summary in summaries]
+        for i, log in enumerate(logs):
+            _run_one(bench, policy, i, log)
+    return delay
 
 
 def _announce_following(following: Following | None) -> None:
@@ -71,11 +71,11 @@ def _announce_following(following: Following | None) -> None:
     note(f"a joint that is more than {most} off its commands stops the robot, by {following.source}")
 
 
-def _measure_delay(bench: Bench, contract: PolicyContract, folder: Path) -> dict[str, str]:
-    """Bring the robot to rest, measure its delay with small steps and log them; return a line of the summary."""
+def _measure_delay(bench: Bench, contract: PolicyContract, folder: Path) -> str:
+    """Bring the robot to rest, measure its delay with small steps and log them; return the delay as a text."""
     config, drive = bench.config, bench.robot.drive
     if config.dry_run or not config.measure_delay or drive.probe is None:
-        return {}
+        return ""
     note("waiting for the robot to come to rest, then a few small steps to measure its delay")
     drive.prepare(bench.rig, config.settle_s)
     witness = Witness(bench.rig)
@@ -85,8 +85,7 @@ def _measure_delay(bench: Bench, contract: PolicyContract, folder: Path) -> dict
         _write_probe(folder / PROBE, bench.robot, witness)
 
 
-def _run_one(bench: Bench, policy: Runner, trial: int, log: Path) -> dict[str, Json]:
-    """Run one episode; return the summary of its session."""
+def _run_one(bench: Bench, policy: Runner, trial: int, log: Path) -> None:
     config = bench.config
     length = f"{config.duration_s:g} s on {config.port}"
     if config.dry_run:
@@ -95,20 +94,17 @@ def _run_one(bench: Bench, policy: Runner, trial: int, log: Path) -> dict[str, J
         note(f"waiting for the robot to come to rest, then {length}")
         bench.robot.drive.prepare(bench.rig, config.settle_s)
     nodes, params = deployment_nodes(bench.robot, bench.rig, policy, trial)
-    return bench.run_episode(nodes, params, log, config.duration_s, "deploy")
+    bench.run_episode(nodes, params, log, config.duration_s, "deploy")
 
 
 # -- the test of the delay, and its log: the model is tested on it as on an episode
 
 
-def check_delay(probe: Probe, witness: Witness, contract: PolicyContract, config: DeployConfig) -> dict[str, str]:
-    """Measure the robot's delay with small steps, and refuse a policy that was not trained with it.
+def check_delay(probe: Probe, witness: Witness, contract: PolicyContract, config: DeployConfig) -> str:
+    """Return the delay as a text, measured with small steps; refuse a policy that was not trained with it.
 
     Args:
         witness: Holds the open robot, at rest and without torque; records the commands and the measurements.
-
-    Returns:
-        Lines of the summary.
 
     Raises:
         DelayChanged: The delay, or its variation, lies outside of the range in training.
@@ -116,7 +112,7 @@ def check_delay(probe: Probe, witness: Witness, contract: PolicyContract, config
     """
     if (trained := contract.trained_s.get(ROUND_TRIP)) is None:
         note("warning: the bundle does not list the delays of its training, so the robot's delay is not measured")
-        return {}
+        return ""
     # A busy machine may delay single steps, so a misfit is measured a second time.
     answers = measure_delay(witness, probe)
     if misfit(answers, trained, config.delay_tolerance_s):
@@ -133,7 +129,7 @@ def check_delay(probe: Probe, witness: Witness, contract: PolicyContract, config
                 "deploy all the same: --force",
             )
         note(f"warning: {message}")
-    return {"measured delay": measured}
+    return measured
 
 
 def misfit(answers: StepAnswers, trained: tuple[float, float], tolerance_s: float) -> str | None:

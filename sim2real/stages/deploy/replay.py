@@ -2,11 +2,12 @@
 
 import math
 from collections.abc import Container, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from sim2real.artifacts.deployment import AS_HERE, Drift, Replay
-from sim2real.artifacts.identification import HELD_OUT, Identification, Noise
+from sim2real.artifacts.deployment import AS_HERE, Drift
+from sim2real.artifacts.identification import HELD_OUT, ComparedError, Identification, Noise
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode
 from sim2real.identification import drift as drift_test
@@ -34,7 +35,7 @@ _LEAST, _LEAST_S = 4, 5.0
 
 def tested(
     robot: RecordedRobot, identification: Identification, episodes: Sequence[Episode]
-) -> tuple[list[Replay], Drift]:
+) -> tuple[list[ComparedError], Drift]:
     """Replay recorded commands on the identified and the nominal model, and test the parameters.
 
     The measurements are compared with those of the simulated sensor, with its delay, at the log's times.
@@ -67,16 +68,16 @@ def tested(
     # Compare the errors with those on the identification's held-out data.
     held_out, held = (_held_out(identification, model, ahead_s) for model in ("identified", "hold"))
     rows = []
-    for position in measured:
-        rmse = next(({"identified": e.error, **e.baselines} for e in errors if e.column == position.column), {})
-        expected, moved, now = held_out.get(position.column), held.get(position.column), rmse.get("hold")
+    sigmas = {position.column: position.sigma for position in measured}
+    for row in errors:
+        expected, moved, now = held_out.get(row.column), held.get(row.column), row.baselines.get("hold")
         if expected is not None:  # a model's error grows with the motion
-            expected = expected_at(identification, position.column, expected)
-            expected = max(expected, NOISE * position.sigma) * max(1.0, now / moved if now and moved else 1.0)
-            expected = math.hypot(expected, alike.get(position.column, 0.0))
+            expected = expected_at(identification, row.column, expected)
+            expected = max(expected, NOISE * sigmas[row.column]) * max(1.0, now / moved if now and moved else 1.0)
+            expected = math.hypot(expected, alike.get(row.column, 0.0))
             # A model that diverges on its own motion bounds nothing.
             expected = expected if math.isfinite(expected) else None
-        rows.append(Replay(position.name, position.unit, ahead_s, rmse, expected, position.column))
+        rows.append(replace(row, source="this deployment", expected=expected, beaten_by=()))
     return rows, drifted
 
 

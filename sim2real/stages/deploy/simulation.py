@@ -60,7 +60,7 @@ def compare(
         rows.append(EpisodeRow(real, simulation, late_shares(recording, bundle), paused_s(recording)))
     # The page shows the first simulation of each episode.
     columns = [{"t": t_s, **states} for _, (t_s, states) in pairs[:count]] or [{}] * count
-    return Deployment(tuple(rows), dict(robot.units), simulated=tuple(columns), recordings=tuple(recordings))
+    return Deployment(tuple(rows), simulated=tuple(columns), recordings=tuple(recordings))
 
 
 def late_shares(recording: Recording, bundle: Bundle) -> dict[str, float]:

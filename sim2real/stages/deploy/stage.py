@@ -10,7 +10,7 @@ import numpy as np
 
 from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.deployment import PROBE, Deployment, EpisodeRow, log_of
-from sim2real.artifacts.identification import ROUND_TRIP, Identification
+from sim2real.artifacts.identification import ROUND_TRIP, Identification, compared_table
 from sim2real.artifacts.recording import TRUTH, Recording
 from sim2real.artifacts.run import StageFolder, finished, newest, open_stage, sha256
 from sim2real.errors import Sim2RealError, UsageError
@@ -49,7 +49,7 @@ def deploy(
         identification: Parameters of the simulation, or their folder; without them there is no gap report.
 
     Returns:
-        The episodes on the robot beside the same in simulation; ``summary`` has the summary of each session.
+        The episodes on the robot beside the same in simulation.
 
     Raises:
         Sim2RealError: The policy does not fit the robot, or the cause that stopped the robot.
@@ -78,12 +78,11 @@ def _deployed(
     # Run the episodes on the robot.
     logs = [log_of(folder, i) for i in range(config.episodes)]
     following = None if identification is None else _following(robot, identification)
-    summaries = run_episodes(robot, bundle, config, logs, following)
+    delay = run_episodes(robot, bundle, config, logs, following)
     recordings = tuple(Recording.load(log) for log in logs)
     if config.dry_run:
         # The robot did not move: there are no scores and no gap.
-        nothing = tuple(EpisodeRow({}) for _ in recordings), dict(robot.units)
-        return Deployment(*nothing, dry_run=True, recordings=recordings, summary=tuple(summaries))
+        return Deployment(tuple(EpisodeRow({}) for _ in recordings), dry_run=True, recordings=recordings)
 
     # Simulate the same. JAX programs are imported and compiled only now, when the robot is at rest.
     from sim2real.stages.deploy.simulation import compare
@@ -94,7 +93,7 @@ def _deployed(
     probe = Recording.load(folder / PROBE) if (folder / PROBE).is_file() else None
 
     # Judge the model and the policy.
-    deployment = replace(deployment, probe=probe, summary=tuple(summaries))
+    deployment = replace(deployment, probe=probe, measured_delay=delay)
     return judge(deployment, robot, bundle, identification, folder)
 
 
@@ -118,8 +117,7 @@ def run(robot: RecordedRobot, config: DeployConfig, root: Path, run_dir: Path | 
         identified = finished(stage.run_dir, "identify")
         identification = None if identified is None else open_identification(identified.output("parameters"), robot)
         deployment = _deployed(robot, bundle, stage.folder, config, identification)
-        summaries = deployment.summary
-        show_sessions(summaries, config.dry_run, config.port == "embedded")
+        show_sessions(deployment.recordings, robot)
         if config.dry_run:
             note("dry run: the robot did not move, so there is no gap report")
 
@@ -132,9 +130,9 @@ def run(robot: RecordedRobot, config: DeployConfig, root: Path, run_dir: Path | 
             for name, file in recording.timing.save(stage.folder, f"timing_{i}").items():
                 stage.output(name, file)
         _show(deployment)
-        stage.summary(_summary_lines(deployment, summaries[-1]))
-        for summary in summaries if config.strict_timing else ():
-            check_deadlines(summary)
+        stage.summary(_summary_lines(deployment))
+        for recording in deployment.recordings if config.strict_timing else ():
+            check_deadlines(recording.summary)
     return stage.result
 
 
@@ -160,7 +158,7 @@ def _following(robot: Robot, identification: Identification) -> Following | None
 
 def _show(deployment: Deployment) -> None:
     """Print the gap to simulation, the tests of the model and the verdict of a deployment."""
-    tables = [deployment.rows(), deployment.times_table(), deployment.replay_table()]
+    tables = [deployment.rows(), deployment.times_table(), compared_table(deployment.replay, "log")]
     tables += [] if deployment.drift is None else [deployment.drift.rows()]
     for content in tables:
         if content.rows:
@@ -171,15 +169,12 @@ def _show(deployment: Deployment) -> None:
             note(f"next: {verdict.next}")
 
 
-def _summary_lines(deployment: Deployment, last: Mapping[str, Json]) -> dict[str, Json]:
-    """Return the lines that the console prints at the end.
-
-    Args:
-        last: Summary of the last session.
-    """
+def _summary_lines(deployment: Deployment) -> dict[str, Json]:
+    """Return the lines that the console prints at the end; the counts are those of the whole session."""
+    last = deployment.recordings[-1].summary
     scores = {f"success, deployment {i}": e.real.get("success") for i, e in enumerate(deployment.episodes)}
     counts = {name: last[name.replace(" ", "_")] for name in ("lost replies", "late replies", "command timeouts")}
-    measured = {name: value for name, value in last.items() if name == "measured delay"}
+    measured = {"measured delay": deployment.measured_delay} if deployment.measured_delay else {}
     return {**{name: round(v, 3) for name, v in scores.items() if v is not None}, **measured, **counts}
 
 

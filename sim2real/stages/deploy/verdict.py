@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -11,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from sim2real.artifacts.bundle import GOOD_SUCCESS, Bundle
-from sim2real.artifacts.deployment import AS_HERE, Deployment, Drift, Finding, Gap, Reason, Replay, Status, Verdict
-from sim2real.artifacts.identification import MAX_ERROR_RATIO, ROUND_TRIP, Identification
+from sim2real.artifacts.deployment import Deployment, Drift, Finding, Gap, Reason, Status, Verdict, as_here
+from sim2real.artifacts.identification import ROUND_TRIP, ComparedError, Identification
 from sim2real.artifacts.paths import shown
 from sim2real.artifacts.run import MANIFEST
 from sim2real.errors import OtherMotion, Sim2RealError
@@ -80,13 +79,13 @@ def _times(deployment: Deployment, bundle: Bundle) -> tuple[Gap, ...]:
         named = None if drift is None or drift.named is None else drift.named.name
         changes = drift.changes if drift is not None and named in (None, ROUND_TRIP) else ()
         now = {c.name: c.now for c in changes}.get(ROUND_TRIP)
-        rows.append(Gap(f"{ROUND_TRIP}_s", now, float(sum(delays.values())), "s"))
+        rows.append(Gap(f"{ROUND_TRIP}_s", now, float(sum(delays.values()))))
     timings = [recording.timing.steps_s for recording in deployment.recordings]
     for node, drawn_s in (bundle.episodes.drawn_s if bundle.episodes else {}).items():
         took_s = np.concatenate([t[node] for t in timings if node in t] or [np.empty(0)])
         for label, q in (("p50", 0.5), ("p99", 0.99)) if drawn_s.size and took_s.size else ():
             real, trained = float(np.quantile(took_s, q)), float(np.quantile(drawn_s, q))
-            rows.append(Gap(f"step_of_{node}_{label}_s", real, trained, "s"))
+            rows.append(Gap(f"step_of_{node}_{label}_s", real, trained))
     return tuple(rows)
 
 
@@ -109,15 +108,15 @@ def _no_comparison(d: Deployment) -> list[Reason]:
 
 def _unexplained(d: Deployment) -> list[Reason]:
     """Motion that no parameters explain, also those fitted to these logs: another identification would not help."""
-    left = {r.name: _ratio(r, AS_HERE) / max(_ratio(r, "identified"), 1e-9) for r in d.replay}
-    faulty = [r for r in d.replay if _ratio(r, AS_HERE) > _FAULTY_RATIO and not left[r.name] <= _MAX_UNEXPLAINED]
-    worst = max(faulty, key=lambda r: _ratio(r, AS_HERE), default=None)
-    return [] if worst is None else [Reason(Finding.UNEXPLAINED, worst.name)]
+    fitted = {r.name: _ratio(as_here(r)) for r in d.replay}
+    left = {r.name: fitted[r.name] / max(_ratio(r), 1e-9) for r in d.replay}
+    faulty = [name for name in fitted if fitted[name] > _FAULTY_RATIO and not left[name] <= _MAX_UNEXPLAINED]
+    return [Reason(Finding.UNEXPLAINED, max(faulty, key=lambda name: fitted[name]))] if faulty else []
 
 
 def _harmless(d: Deployment) -> list[Reason]:
     """A changed parameter, while all predictions are within their expected errors and the policy succeeds."""
-    holds = all(r.expected is not None and _ratio(r, "identified") <= 1.0 for r in d.replay)
+    holds = all(r.ratio is not None and r.ratio <= 1.0 for r in d.replay)
     return [Reason(Finding.SUCCESS), *_changed(d)] if holds and _changed(d) and not _failed(d) else []
 
 
@@ -128,7 +127,7 @@ def _changed(d: Deployment) -> list[Reason]:
 
 def _wrong(d: Deployment) -> list[Reason]:
     """Errors above the expected ones."""
-    wrong = [Reason(Finding.WRONG, r.name) for r in d.replay if _ratio(r, "identified") > MAX_ERROR_RATIO]
+    wrong = [Reason(Finding.WRONG, r.name) for r in d.replay if r.exceeded]
     likely = [Reason(Finding.LIKELY, d.drift.likely.name)] if d.drift and d.drift.likely else []
     return [*wrong, *likely] if wrong else []
 
@@ -186,12 +185,9 @@ def _model(d: Deployment) -> Reason:
     return d.untested or Reason(Finding.HOLDS)
 
 
-def _ratio(row: Replay, model: str) -> float:
-    """Return the ratio of a model's error to the expected one: 1 without one, infinite if the model diverged."""
-    error = row.rmse.get(model)
-    if row.expected is None:
-        return 1.0
-    return math.inf if error is None else error / row.expected
+def _ratio(row: ComparedError) -> float:
+    """Return the ratio of an error to the expected one: 1 without one, infinite if the model diverged."""
+    return 1.0 if row.ratio is None else row.ratio
 
 
 # -- the command to type next

@@ -4,7 +4,7 @@ import math
 import select
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from sim2real.artifacts.files import plain
+from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run import git_state, versions
 from sim2real.errors import ERROR, OK, DeadlineExceeded, SafetyStop, Sim2RealError
 from sim2real.graph.base import GraphState
@@ -25,14 +26,14 @@ from sim2real.later import jax
 from sim2real.log.writer import McapRecorder
 from sim2real.robots.loop import ACTUATOR, AGENT, ROLES, SENSOR
 from sim2real.robots.nodes import connected
-from sim2real.robots.robot import Robot, joint_columns
+from sim2real.robots.robot import Robot, as_columns, joint_columns
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import MonotonicClock, realtime
 from sim2real.runtime.failure import noted
 from sim2real.runtime.virtual import VirtualClock
 from sim2real.stages.deploy.config import DeployConfig
 from sim2real.stages.session.config import RecordConfig
-from sim2real.stages.terminal.console import note, progress, table
+from sim2real.stages.terminal.console import artifact_table, note, progress, table
 from sim2real.stages.terminal.interruption import interruptible
 
 LATE_SHARE = 0.01
@@ -46,20 +47,12 @@ _INTERRUPTED = 130
 class Watch:
     """A recorder that passes everything on, and stops the graph on a NaN.
 
-    Args:
-        actuator: The node whose commands are summarised.
-        field: Field of its output with a number for each motor.
-
     Attributes:
         monotonic_ns: When the episode started.
-        commands: Number of the actuator's commands.
-        low, total, high: Of each motor, over these commands.
     """
 
-    def __init__(self, recorder: Recorder, actuator: str, field: str) -> None:
-        self._recorder, self._actuator, self._field = recorder, actuator, field
-        self.monotonic_ns = self.commands = 0
-        self.low, self.total, self.high = np.array([np.inf]), np.zeros(1), np.array([-np.inf])
+    def __init__(self, recorder: Recorder) -> None:
+        self._recorder, self.monotonic_ns = recorder, 0
 
     def start(self, epoch_ns: int, monotonic_ns: int) -> None:
         """Keep when the episode starts."""
@@ -69,15 +62,10 @@ class Watch:
     def step(self, record: StepRecord, output: Any) -> None:
         """Pass a step on."""
         self._recorder.step(record, output)
-        leaves = named_leaves(output)
-        for name, leaf in leaves.items():
+        for name, leaf in named_leaves(output).items():
             values = np.asarray(leaf)
             if values.dtype.kind == "f" and np.isnan(values).any():
                 raise SafetyStop(f"node {record.node!r} stopped: its output {name!r} is NaN in step {record.seq}")
-        if record.node == self._actuator:
-            sent = np.atleast_1d(np.asarray(leaves[self._field], np.float64))
-            self.commands, self.total = self.commands + 1, self.total + sent
-            self.low, self.high = np.minimum(self.low, sent), np.maximum(self.high, sent)
 
     def message(self, record: MessageRecord) -> None:
         """Pass the fate of a message on."""
@@ -112,14 +100,11 @@ class Bench:
 
     def run_episode(
         self, nodes: Mapping[str, BaseNode], params: Mapping[str, Any], log: Path, duration_s: float, label: str
-    ) -> dict[str, Any]:
+    ) -> None:
         """Run the graph and log it; after every failure the motors have no torque and the log is readable.
 
         Args:
             duration_s: How long to run [s].
-
-        Returns:
-            The summary, which the log's ``session_end`` has too: timing by node, losses, the gate's counts.
 
         Raises:
             Sim2RealError: What stopped the robot.
@@ -132,7 +117,7 @@ class Bench:
         graph.warmup(state)  # every program is compiled before torque goes on
         # Start the log, and run; an interrupted episode comes to rest before torque goes off.
         recorder = self._recorder(graph, state, log)
-        watch = Watch(recorder, ACTUATOR, self.robot.drive.command)
+        watch = Watch(recorder)
         graph.recorder = watch
         try:
             try:
@@ -149,9 +134,7 @@ class Bench:
             _end(error, graph, recorder, lambda: self._summary(graph, watch))
             raise
         # A failure ends without torque, and the log holds it.
-        summary = self._summary(graph, watch)
-        recorder.close("finished", OK, summary, note)
-        return summary
+        recorder.close("finished", OK, self._summary(graph, watch), note)
 
     def _recorder(self, graph: AsyncGraph, state: GraphState, log: Path) -> McapRecorder:
         """Return the log's writer, whose metadata describes the session; a dry run comes first."""
@@ -189,26 +172,17 @@ class Bench:
         return McapRecorder(log, metadata, {}, state.aux["outputs"], inputs, joints, units)
 
     def _summary(self, graph: AsyncGraph, watch: Watch) -> dict[str, Any]:
-        # Times of the nodes, in the order of the loop.
+        """Return what no log of steps and messages has: counters of nodes, bus and gate.
+
+        ``bus``: how long the transactions of each node took, see ``BusUse`` [us]; ``late_replies``: answers whose
+        sample's time is not sure, or that came after they had been asked for again.
+        """
         rig, counters = self.rig, self.rig.device.counters
-        timing = {
-            n: {
-                "steps": s.steps,
-                "period_s": _numbers(s.period_s),
-                "lateness_s": _numbers(s.lateness_s),
-                "overruns": s.overruns,
-                "age_s": {name: _numbers(ages) for name, ages in s.age_s.items()},
-            }
-            for n, s in sorted(graph.statistics().items(), key=lambda item: _place(graph.nodes[item[0]]))
-        }
-        # Counters of bus, gate and commands. `bus`: how long the transactions of each node took, see ``BusUse`` [us];
-        # `late_replies`: answers whose sample's time is not sure, or that came after they had been asked for again;
-        # `late_s`: by how much answers took longer than their bytes, median, 99 % and largest [s].
-        late_s = np.quantile(counters.late_s, [0.5, 0.99, 1.0]).tolist() if counters.late_s.size else [None] * 3
+        nodes = sorted(graph.statistics().items(), key=lambda item: _place(graph.nodes[item[0]]))
         uses = {SENSOR: rig.measuring, ACTUATOR: rig.commanding}
         return {
             "monotonic_ns": watch.monotonic_ns,
-            "timing": timing,
+            "timing": {n: {"steps": s.steps, "overruns": s.overruns} for n, s in nodes},
             "bus": {
                 name: {kind: values.tolist() for kind, values in asdict(use).items()} for name, use in uses.items()
             },
@@ -217,26 +191,8 @@ class Bench:
             "retries": counters.retries,
             "command_timeouts": rig.timeouts,
             "late_replies": counters.late_replies,
-            "late_s": late_s,
             "gate": asdict(rig.gate.counts),
-            "sent": self._sent_rows(watch),
         }
-
-    def _sent_rows(self, watch: Watch) -> list[dict[str, Any]]:
-        """Return for each motor which commands were sent, or withheld in a dry run: lowest, mean and highest."""
-        field, joints = self.robot.drive.command, self.rig.gate.config.joints
-        several = len(watch.total) > 1
-        return [
-            {
-                "name": joints[i] if i < len(joints) else f"{field}[{i}]" if several else field,
-                "unit": self.robot.units.get(field, ""),
-                "commands": watch.commands,
-                "low": float(watch.low[i]),
-                "mean": float(total) / watch.commands,
-                "high": float(watch.high[i]),
-            }
-            for i, total in enumerate(watch.total if watch.commands else ())
-        ]
 
 
 def _drive(
@@ -308,55 +264,35 @@ def check_deadlines(summary: Mapping[str, Any]) -> None:
         )
 
 
-def timing_rows(summary: Mapping[str, Any]) -> tuple[list[list[Any]], list[str]]:
-    """Return the timing table of a summary: rows and headers, times in ms; ages are those of its oldest input."""
-    quantiles = ["p50", "p99", "max [ms]"]
-    headers = ["node", "steps", "period p50", *quantiles[1:], "late p50", *quantiles[1:], "age p50", *quantiles[1:]]
-    rows = []
-    for name, node in summary["timing"].items():
-        ages = [max(q) for q in zip(*node["age_s"].values(), strict=True)] or [None] * 3
-        kinds = (node["period_s"], node["lateness_s"], ages)
-        times = [q if q is None else round(1e3 * q, 2) for kind in kinds for q in kind]
-        rows.append([name, node["steps"], *times, node["overruns"]])
-    if "late_s" in summary:  # the bus: its answers, how late they were, how many too late
-        late = [q if q is None else round(1e3 * q, 2) for q in summary["late_s"]]
-        nothing = [None] * 3
-        rows.append(["answers", summary["transactions"], *nothing, *late, *nothing, summary["late_replies"]])
-    return rows, [*headers, "overruns"]
-
-
-def show_sessions(summaries: Sequence[Mapping[str, Any]], dry_run: bool, embedded: bool) -> None:
+def show_sessions(recordings: Sequence[Recording], robot: Robot) -> None:
     """Print the timing of the last session and the warnings of all; of a dry run the withheld commands, too."""
-    print(table(*timing_rows(summaries[-1])))
-    for summary in summaries:
-        share = summary["late_replies"] / max(1, summary["transactions"])
+    print(artifact_table(recordings[-1].timing.rows()))
+    for recording in recordings:
+        share = recording.summary["late_replies"] / max(1, recording.summary["transactions"])
         if share > LATE_SHARE:
+            embedded = recording.episode.metadata["port"] == "embedded"
             adapter = "" if embedded else ", and set the latency timer of a USB adapter to 1 ms"
             note(
                 f"warning: {share:.1%} of the answers came late: when those samples were taken is not sure\n"
                 f"hint: close what else runs on this computer{adapter}"
             )
-    if not dry_run:
+    withheld = [recording for recording in recordings if recording.dry_run and ACTUATOR in recording.episode.outputs]
+    if not withheld:
         return
-    several = len(summaries) > 1
-    rows = []
-    for number, summary in enumerate(summaries):
-        for s in summary["sent"]:
-            figures = [s["unit"], s["commands"], s["low"], s["mean"], s["high"]]
-            rows.append([*([number] if several else []), s["name"], *figures])
-    heads = ["would have been sent to", "unit", "commands", "min", "mean", "max"]
-    print(table(rows, [*(["episode"] if several else []), *heads]))
+    field, rows = robot.drive.command, []
+    for number, recording in enumerate(withheld):
+        commands = as_columns({field: recording.episode.outputs[ACTUATOR][field]})
+        joints = [channel.name for channel in robot.sensor.channels]
+        names = joints if len(joints) == len(commands) else list(commands)
+        for name, sent in zip(names, commands.values(), strict=True):
+            rows.append([number, name, robot.units.get(field, ""), len(sent), sent.min(), sent.mean(), sent.max()])
+    print(table(rows, ["episode", "would have been sent to", "unit", "commands", "min", "mean", "max"]))
     note("dry run: no joint was moved; no later stage uses this as a recording")
 
 
 def _place(node: BaseNode) -> float:
     """Return a node's place in tables: nodes with an ``order`` first, the others in the graph's order."""
     return math.inf if node.order is None else node.order
-
-
-def _numbers(values: Iterable[float]) -> list[float | None]:
-    """Return the values for JSON, which has no NaN: a node without a step has no times."""
-    return [v if math.isfinite(v) else None for v in values]
 
 
 def _exit_code(error: BaseException) -> int:

@@ -93,7 +93,7 @@ def run(robot: RecordedRobot, config: RecordConfig, root: Path, run_dir: Path | 
         summary = recording.summary
         for name, path in recording.timing.save(stage.folder).items():
             stage.output(name, path)
-        show_sessions([summary], config.dry_run, config.port == "embedded")
+        show_sessions([recording], robot)
         if config.by_hand:
             _show_by_hand(recording, robot)
         stage.summary(
