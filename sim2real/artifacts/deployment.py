@@ -58,7 +58,7 @@ class EpisodeRow:
 
 @dataclass(frozen=True)
 class Gap:
-    """One quantity on the robot, and in simulation or in training; its name ends with its unit."""
+    """One score on the robot and in simulation; its name ends with its unit."""
 
     quantity: str
     real: float | None
@@ -66,7 +66,7 @@ class Gap:
 
     @property
     def gap(self) -> float | None:
-        """The robot's value less the other one."""
+        """The robot's value less that in simulation."""
         return None if self.real is None or self.simulation is None else self.real - self.simulation
 
 
@@ -214,7 +214,6 @@ class Deployment(Shown):
 
     Attributes:
         measured_delay: The delay before the episodes, as a text; "" if it was not measured.
-        times: Times on the robot, and the times that the policy was trained with.
         replay: Error of the identified model on the recorded commands, for each measured position; beside it those of
             the nominal model, and of the model with the parameters fitted to these logs, ``AS_HERE``.
         drift: Test for parameters that have changed since the identification; None if it did not run.
@@ -228,7 +227,6 @@ class Deployment(Shown):
 
     episodes: tuple[EpisodeRow, ...]
     measured_delay: str = ""
-    times: tuple[Gap, ...] = ()
     replay: tuple[ComparedError, ...] = ()
     drift: Drift | None = None
     untested: Reason | None = None
@@ -314,11 +312,9 @@ class Deployment(Shown):
 
     def rows(self) -> ArtifactTable:
         """Return the gap: a row for each score."""
-        return _gap_table(("quantity", "robot", "simulation", "gap", "unit"), self.gap)
-
-    def times_table(self) -> ArtifactTable:
-        """Return the times on the robot and in training: a row for each."""
-        return _gap_table(("times", "robot", "in training", "gap", "unit"), self.times)
+        words = [words_and_unit(g.quantity) for g in self.gap]
+        rows = [[name, g.real, g.simulation, g.gap, unit] for g, (name, unit) in zip(self.gap, words, strict=True)]
+        return ArtifactTable(("quantity", "robot", "simulation", "gap", "unit"), rows)
 
     # The files.
 
@@ -383,13 +379,6 @@ def mean(values: Sequence[float | None]) -> float | None:
     """Return the mean of the values that exist; None if none does."""
     present = [v for v in values if v is not None]
     return float(np.mean(present)) if present else None
-
-
-def _gap_table(headers: Sequence[str], gaps: Sequence[Gap]) -> ArtifactTable:
-    """Return a row for each quantity; the end of its name is its unit."""
-    words = [words_and_unit(gap.quantity) for gap in gaps]
-    rows = [[name, g.real, g.simulation, g.gap, unit] for g, (name, unit) in zip(gaps, words, strict=True)]
-    return ArtifactTable(headers, rows)
 
 
 def log_of(folder: Path, number: int) -> Path:

@@ -135,7 +135,7 @@ def compare(config: ReportConfig) -> Comparison:
         identification = None if identify is None else Identification.load(identify.folder)
         deployment = None if deploy is None else Deployment.read(deploy.folder)
         runs.append(ComparedRun(name, started.replace("T", " ")[:16], identification, deployment))
-    comparison = Comparison.of(runs)
+    comparison = Comparison(tuple(runs))
     if not comparison.parameters and not all(r.deployment for r in comparison.runs):
         raise UsageError(
             f"nothing to compare: these runs of {robots[0]} share no identified parameter and no deployment",

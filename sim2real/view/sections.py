@@ -379,9 +379,6 @@ def _deploy_tables(deployed: Deployment) -> list[Block]:
             "expected error of the identification."
         )
         blocks.append(TableBlock.of(caption, compared_table(deployed.replay, "log")))
-    if deployed.times:
-        caption = "Times on the robot, and the times that the policy was trained with"
-        blocks.append(TableBlock.of(caption, deployed.times_table()))
     return blocks
 
 

@@ -70,7 +70,7 @@ def world(tmp_path, finished_run_dir):
         probe = Recording.load(stage.folder / PROBE)
         found = Deployment((EpisodeRow({"success": 0.0}),), recordings=logs, probe=probe)
         known = Identification.load(finished(run_dir, "identify").output("parameters"))
-        for name, file in judge(found, pipeline, bundle, known, stage.folder).save(stage.folder).items():
+        for name, file in judge(found, pipeline, known, stage.folder).save(stage.folder).items():
             stage.output(name, file)
 
     def call(name, config, run_dir):

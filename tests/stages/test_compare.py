@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from sim2real import cli
-from sim2real.artifacts.comparison import ComparedRun, Comparison
+from sim2real.artifacts.comparison import ComparedRun, Comparison, overlap
 from sim2real.artifacts.identification import Estimate, Identification, Judgement
 from sim2real.errors import USAGE
 
@@ -20,14 +20,14 @@ def identification(values, errors, unit="1"):
 
 
 def comparison(*identifications):
-    return Comparison.of([ComparedRun(f"run {i}", "", found) for i, found in enumerate(identifications)])
+    return Comparison(tuple(ComparedRun(f"run {i}", "", found) for i, found in enumerate(identifications)))
 
 
 def test_parameters_whose_intervals_do_not_overlap_are_named():
     first, second = identification([1.0, 2.0, 3.0], [0.1] * 3), identification([1.3, 2.5, 3.0], [0.1] * 3)
     found = comparison(first, second)
     assert found.different == ("p1",)
-    assert [p.overlap for p in found.parameters] == [True, False, True]
+    assert [overlap(row) for row in found.parameters.values()] == [True, False, True]
     assert first.intervals["p1"] == pytest.approx((1.804, 2.196))
 
 
@@ -36,7 +36,7 @@ def test_parameters_without_intervals_are_shown_and_not_compared():
     fixed = replace(fixed, parameters=(fixed.parameters[0], replace(fixed.parameters[1], low95=None)))
     other_unit = identification([5.0], [0.1], "rad")
     found = comparison(fixed, identification([1.0, 3.5], [0.1, 0.1]), other_unit)
-    assert [(p.name, p.overlap) for p in found.parameters] == [("p0", True), ("p1", None)]
+    assert [(name, overlap(row)) for (name, _), row in found.parameters.items()] == [("p0", True), ("p1", None)]
     assert found.rows().rows[1] == ["p1", "1", "3", "3.5 ± 0.2", "-", ""]
 
 

@@ -195,10 +195,10 @@ def replace_terms(terms):
 def test_a_deployment_without_an_identification_says_so(folder):
     pipeline, found = load_robot("pendulum"), deployed()
     alone = replace(found, episodes=tuple(replace(e, simulation={}) for e in found.episodes))
-    told = verdict.judge(alone, pipeline, BUNDLE, None, folder).verdict
+    told = verdict.judge(alone, pipeline, None, folder).verdict
     assert (told.status, told.next) == ("not judged", "sim2real identify pendulum --run runs/pendulum/T")
     # A robot that is simulated in plain MuJoCo needs none.
-    assert verdict.judge(found, pipeline, BUNDLE, None, folder).verdict.status == "fine"
+    assert verdict.judge(found, pipeline, None, folder).verdict.status == "fine"
 
 
 def test_a_policy_that_does_not_move_is_trained_again_though_its_model_cannot_be_tested(folder, monkeypatch):
@@ -208,17 +208,17 @@ def test_a_policy_that_does_not_move_is_trained_again_though_its_model_cannot_be
     monkeypatch.setattr(replay, "tested", too_little)
     pipeline = load_robot("pendulum")
     still = replace(deployed(success=0.0), replay=(), drift=None)
-    found = verdict.judge(still, pipeline, BUNDLE, IDENTIFIED, folder)
+    found = verdict.judge(still, pipeline, IDENTIFIED, folder)
     told = found.verdict
     assert (told.status, told.next) == ("re-train", "sim2real train pendulum --run runs/pendulum/T")
     assert found.reasons == ("success is 0.00, in simulation 1.00", "0.0 s of them in motion")
     moved = replace(deployed(), replay=(), drift=None)
-    assert verdict.judge(moved, pipeline, BUNDLE, IDENTIFIED, folder).verdict.status == "not judged"
+    assert verdict.judge(moved, pipeline, IDENTIFIED, folder).verdict.status == "not judged"
 
 
 def test_the_verdict_is_in_the_artifact(folder):
     """The run's folder may move, so the next command names it only when it is read."""
-    found = verdict.judge(replace(deployed(success=0.5), recordings=()), load_robot("pendulum"), BUNDLE, None, folder)
+    found = verdict.judge(replace(deployed(success=0.5), recordings=()), load_robot("pendulum"), None, folder)
     found.save(folder)
     moved = folder.parents[1] / "moved" / "deploy"
     folder.parent.rename(moved.parent)

@@ -135,7 +135,7 @@ def test_a_recorded_motion_of_the_pendulum_is_checked_and_played(tmp_path, capsy
     np.savetxt(tmp_path / "v.csv", np.column_stack([t_s, volts]), delimiter=",", header="t_s,command", comments="")
     runs = ["--runs", str(tmp_path / "runs")]
     assert cli.main(["record", "pendulum", "--excitation", str(tmp_path / "v.csv"), *runs]) == 0
-    assert "motion: its recording" in capsys.readouterr().err
+    assert "motion: command of v.csv, 3.0 s" in capsys.readouterr().err
     log = read_log(newest(tmp_path / "runs", "pendulum", "record").output("log"))
     sent = log.outputs["agent"]["action"].ravel()
     np.testing.assert_allclose(sent, volts[: len(sent)], atol=1e-6)

@@ -12,7 +12,7 @@ from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.deployment import PROBE, Deployment, EpisodeRow, log_of
 from sim2real.artifacts.identification import ROUND_TRIP, Identification, compared_table
 from sim2real.artifacts.recording import TRUTH, Recording
-from sim2real.artifacts.run import StageFolder, finished, newest, open_stage, sha256
+from sim2real.artifacts.run import StageFolder, finished, newest, open_stage
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.hardware.device import Following
 from sim2real.installation import has_jax
@@ -94,7 +94,7 @@ def _deployed(
 
     # Judge the model and the policy.
     deployment = replace(deployment, probe=probe, measured_delay=delay)
-    return judge(deployment, robot, bundle, identification, folder)
+    return judge(deployment, robot, identification, folder)
 
 
 def run(robot: RecordedRobot, config: DeployConfig, root: Path, run_dir: Path | None) -> StageFolder:
@@ -158,7 +158,7 @@ def _following(robot: Robot, identification: Identification) -> Following | None
 
 def _show(deployment: Deployment) -> None:
     """Print the gap to simulation, the tests of the model and the verdict of a deployment."""
-    tables = [deployment.rows(), deployment.times_table(), compared_table(deployment.replay, "log")]
+    tables = [deployment.rows(), compared_table(deployment.replay, "log")]
     tables += [] if deployment.drift is None else [deployment.drift.rows()]
     for content in tables:
         if content.rows:
@@ -195,22 +195,7 @@ def find_bundle(
         note(f"pipeline {robot.name!r} has no training here: its shipped policy is deployed")
         return shipped, run_dir
     training = warn_of_stale(training)
-    require_untouched(training)
     return training.output("bundle"), run_dir or training.run_dir
-
-
-def require_untouched(training: StageFolder) -> None:
-    """Refuse a bundle whose hash differs from the one in the manifest of its training.
-
-    Raises:
-        Sim2RealError: The hashes differ.
-    """
-    path, written = training.output("bundle"), training.manifest.outputs["bundle"].sha256
-    if sha256(path) != written:
-        raise Sim2RealError(
-            f"{path} is not the bundle that its training wrote: its hash is not the one in the manifest",
-            hint="train again; --bundle FOLDER deploys it without this check",
-        )
 
 
 def require_fit(robot: Robot, bundle: Bundle, config: DeployConfig) -> None:

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from sim2real.artifacts.bundle import GOOD_SUCCESS, Bundle
-from sim2real.artifacts.deployment import Deployment, Drift, Finding, Gap, Reason, Status, Verdict, as_here
-from sim2real.artifacts.identification import ROUND_TRIP, ComparedError, Identification
+from sim2real.artifacts.bundle import GOOD_SUCCESS
+from sim2real.artifacts.deployment import Deployment, Drift, Finding, Reason, Status, Verdict, as_here
+from sim2real.artifacts.identification import ComparedError, Identification
 from sim2real.artifacts.paths import shown
 from sim2real.artifacts.run import MANIFEST
 from sim2real.errors import OtherMotion, Sim2RealError
@@ -36,16 +36,15 @@ _ENOUGH_S = 12.0
 
 
 def judge(
-    deployment: Deployment, robot: RecordedRobot, bundle: Bundle, identification: Identification | None, folder: Path
+    deployment: Deployment, robot: RecordedRobot, identification: Identification | None, folder: Path
 ) -> Deployment:
-    """Return a deployment with the tests of its model, its times beside those of training, and a verdict.
+    """Return a deployment with the tests of its model, and a verdict.
 
     Args:
         identification: The model; None: it is not tested.
         folder: Folder of the deployment, for the next command.
     """
     deployment = _tested(deployment, robot, identification)
-    deployment = replace(deployment, times=_times(deployment, bundle))
     verdict = decide(deployment)
     typed = next_command(verdict, deployment, robot, identification, folder)
     return replace(deployment, verdict=replace(verdict, next=typed))
@@ -69,24 +68,6 @@ def _tested(deployment: Deployment, robot: RecordedRobot, identification: Identi
     except (Sim2RealError, ArithmeticError, np.linalg.LinAlgError) as error:
         return replace(deployment, untested=Reason(Finding.UNTESTED, str(error.args[0])))
     return replace(deployment, replay=tuple(replay), drift=drift)
-
-
-def _times(deployment: Deployment, bundle: Bundle) -> tuple[Gap, ...]:
-    """Return the robot's times beside those of training: the sum of the delays, and each node's computation time."""
-    rows, drift = [], deployment.drift
-    if delays := bundle.contract.delays_s:
-        # The drift test estimates the present sum of the delays, unless the change is that of another parameter.
-        named = None if drift is None or drift.named is None else drift.named.name
-        changes = drift.changes if drift is not None and named in (None, ROUND_TRIP) else ()
-        now = {c.name: c.now for c in changes}.get(ROUND_TRIP)
-        rows.append(Gap(f"{ROUND_TRIP}_s", now, float(sum(delays.values()))))
-    timings = [recording.timing.steps_s for recording in deployment.recordings]
-    for node, drawn_s in (bundle.episodes.drawn_s if bundle.episodes else {}).items():
-        took_s = np.concatenate([t[node] for t in timings if node in t] or [np.empty(0)])
-        for label, q in (("p50", 0.5), ("p99", 0.99)) if drawn_s.size and took_s.size else ():
-            real, trained = float(np.quantile(took_s, q)), float(np.quantile(drawn_s, q))
-            rows.append(Gap(f"step_of_{node}_{label}_s", real, trained))
-    return tuple(rows)
 
 
 # -- the rules: the first one whose findings are not empty decides

@@ -285,7 +285,8 @@ def show_sessions(recordings: Sequence[Recording], robot: Robot) -> None:
         joints = [channel.name for channel in robot.sensor.channels]
         names = joints if len(joints) == len(commands) else list(commands)
         for name, sent in zip(names, commands.values(), strict=True):
-            rows.append([number, name, robot.units.get(field, ""), len(sent), sent.min(), sent.mean(), sent.max()])
+            ends = sent.min(), sent.mean(), sent.max()
+            rows.append([number, name, robot.units.get(field, ""), len(sent), *map(float, ends)])
     print(table(rows, ["episode", "would have been sent to", "unit", "commands", "min", "mean", "max"]))
     note("dry run: no joint was moved; no later stage uses this as a recording")
 

@@ -11,11 +11,9 @@ import numpy as np
 from sim2real.artifacts.paths import shown
 from sim2real.artifacts.recording import LOG, TRUTH, Recording
 from sim2real.artifacts.run import StageFolder, open_stage
-from sim2real.installation import has_jax
 from sim2real.robots.loop import SENSOR
 from sim2real.robots.nodes import recording_nodes
 from sim2real.robots.robot import RecordedRobot, Robot
-from sim2real.stages.check.config import CheckConfig
 from sim2real.stages.live import live_view, scene_of
 from sim2real.stages.load import AnyRobot, defaults_of, moving, robot_of
 from sim2real.stages.session.config import RecordConfig
@@ -43,7 +41,7 @@ def record(robot: AnyRobot, folder: AnyPath, config: RecordConfig | Mapping[str,
     robot, folder = moving(robot_of(robot)), folder_of(folder)
     config = config_of(config, defaults_of(robot).record)
     log, truth = folder / LOG, folder / TRUTH
-    signal = None if config.by_hand else _planned(config, robot)
+    signal = None if config.by_hand else played(config, robot, announce=True)
     duration_s = config.duration_s if signal is None else len(signal) / robot.drive.rate_hz
     note(f"recording {duration_s:g} s of {config.excitation} on {config.port}")
     with live_view(config.view, folder, robot.name, partial(scene_of, robot)), opened(robot, config, truth) as bench:
@@ -53,26 +51,6 @@ def record(robot: AnyRobot, folder: AnyPath, config: RecordConfig | Mapping[str,
         nodes = recording_nodes(robot, bench.rig, signal, config.standing)
         bench.run_episode(nodes, {}, log, duration_s, "record")
     return Recording.load(log, truth)
-
-
-def _planned(config: RecordConfig, robot: Robot) -> np.ndarray:
-    """Return the commands to play; of a motion from a file, print first what its recording cannot determine."""
-    signal = played(config, robot, announce=True)
-    if config.motion is None or config.dry_run:
-        return signal
-    if not has_jax():
-        note("which parameters this motion determines is not checked: JAX is not installed here")
-        return signal
-    from sim2real.stages.check.stage import check  # JAX programs take seconds to compile
-
-    checked = check(robot, None, CheckConfig(plan=True, record=config))
-    if groups := [", ".join(group) for group in checked.undetermined]:
-        note(f"motion: its recording does not determine {' or '.join(groups)}", urgent=True)
-        for message in checked.messages:
-            note(f"- {message}")
-    else:
-        note("motion: its recording determines all parameters")
-    return signal
 
 
 def run(robot: RecordedRobot, config: RecordConfig, root: Path, run_dir: Path | None) -> StageFolder:
