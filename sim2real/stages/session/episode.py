@@ -282,7 +282,7 @@ def show_sessions(recordings: Sequence[Recording], robot: Robot) -> None:
     field, rows = robot.drive.command, []
     for number, recording in enumerate(withheld):
         commands = as_columns({field: recording.episode.outputs[ACTUATOR][field]})
-        joints = [channel.name for channel in robot.sensor.channels]
+        joints = [channel.name for channel in robot.drive.channels]
         names = joints if len(joints) == len(commands) else list(commands)
         for name, sent in zip(names, commands.values(), strict=True):
             ends = sent.min(), sent.mean(), sent.max()
