@@ -25,6 +25,8 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").r
 NIGHT = pytest.mark.night
 OPTIONAL = {"stable_baselines3"}
 """Packages that no extra brings: their blocks are left out where they are not installed."""
+FOREIGN = {"MovableCamera", "NameScope", "Twist", "VecNormalize"}
+"""Classes of others that pages name and our code does not."""
 GROUPS = {"sim2real.pipelines", "sim2real.devices", "sim2real.worlds"}
 """Groups of entry points, which are named like modules."""
 
@@ -185,6 +187,39 @@ def test_command_lines_of_pages_have_flags_that_exist():
     assert unknown_flags("sim2real train pendulum --seed 1 --sead 2  # --none") == ["--sead"]
 
 
+def commands_of(page: str) -> set[str]:
+    """Return the commands in tables with a column ``command``, and in backticks with a flag, without ``sim2real``."""
+    found, column = set(re.findall(r"`([a-z]+ [^`]*--[^`]*)`", page)), None
+    for line in page.splitlines():
+        cells = [cell.strip() for cell in line.split("|")] if line.startswith("|") else []
+        if not cells or "command" in cells:
+            column = cells.index("command") if cells else None
+        elif column is not None:
+            found |= {quoted.removeprefix("sim2real ") for quoted in re.findall(r"`([^`]+)`", cells[column])}
+    return found
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_bare_commands_of_a_page_exist(page):
+    commands = {line: line.split()[0] for line in commands_of(without_code(page.read_text()))}
+    in_tables = {line for line in commands if "--" not in line}
+    assert {line for line in in_tables if commands[line] not in COMMANDS} == set()
+    mine = [line for line, first in commands.items() if first in COMMANDS]
+    assert {line: flags for line in mine if (flags := unknown_flags(f"sim2real {line}"))} == {}
+
+
+def test_tables_and_backticks_with_commands_that_do_not_exist_are_found():
+    page = "| command | does |\n|---|---|\n| `compare`, `sim2real info` | `x` |\n\n`train --sead 1`, `x`\n"
+    assert commands_of(page) == {"compare", "info", "train --sead 1"}
+
+
+def test_benches_of_pages_exist():
+    benches = set(re.findall(r'^    "([a-z][\w-]*)": ', (ROOT / "scripts" / "bench.py").read_text(), re.MULTILINE))
+    used = {name for page in PAGES for name in re.findall(r"scripts/bench\.py ([a-z][\w-]*)", page.read_text())}
+    assert "league" in used & benches
+    assert used - benches == set()
+
+
 # -- links and names
 
 
@@ -217,6 +252,25 @@ def test_names_of_modules_classes_and_functions_on_pages_exist():
     names = {m[0]: p.name for p in PAGES for m in re.finditer(r"\bsim2real(?:\.[A-Za-z_]\w*)+", p.read_text())}
     assert [(page, name) for name, page in names.items() if name not in GROUPS and not exists(name)] == []
     assert not exists("sim2real.graph.no_such_module")
+
+
+@functools.cache
+def words_of_the_code() -> set[str]:
+    """Return all words of our code, of the packages in tests, and of the files beside robots."""
+    folders = ("sim2real", "pipelines", "scripts", "tests/plugin", "tests/hardware")
+    files = [
+        p for folder in folders for p in (ROOT / folder).rglob("*") if p.suffix in (".py", ".toml", ".xml", ".jinja")
+    ]
+    return set(re.findall(r"\w+", "\n".join(p.read_text() for p in files)))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_classes_in_backticks_exist(page):
+    """Their attributes too; a page may name classes of its own code, a tutorial those of the reader."""
+    text = page.read_text()
+    own = set(re.findall(r"\w+", "\n".join(python_of(page.relative_to(ROOT).as_posix()))))
+    named = re.findall(r"`([A-Z]\w*[a-z]\w*(?:\.\w+)*)(?:\([^`]*\))?`", without_code(text))
+    assert [name for name in named if not set(name.split(".")) <= words_of_the_code() | own | FOREIGN] == []
 
 
 def exists(name: str) -> bool:
