@@ -9,12 +9,10 @@ import io
 import itertools
 import re
 import shlex
-import shutil
 import textwrap
 from pathlib import Path
 
 import jax
-import numpy as np
 import pytest
 
 from sim2real import cli
@@ -25,7 +23,7 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").r
 NIGHT = pytest.mark.night
 OPTIONAL = {"stable_baselines3"}
 """Packages that no extra brings: their blocks are left out where they are not installed."""
-FOREIGN = {"MovableCamera", "NameScope", "Twist", "VecNormalize"}
+FOREIGN = {"Buffer", "MovableCamera", "NameScope", "Twist", "VecNormalize"}
 """Classes of others that pages name and our code does not."""
 GROUPS = {"sim2real.pipelines", "sim2real.devices", "sim2real.worlds"}
 """Groups of entry points, which are named like modules."""
@@ -47,7 +45,6 @@ MARKS = {
     "docs/guides/identify.md": [NIGHT],
     "docs/guides/interop.md": [NIGHT],
     "docs/guides/notebook.md": [NIGHT],
-    "docs/guides/record.md": [NIGHT],
     "docs/reference/identification.md": [NIGHT],
     "docs/reference/runs.md": [NIGHT],
     "docs/tutorial.md": [NIGHT],
@@ -67,11 +64,8 @@ SMALLER = {
     "sim2real.identification": {"FitConfig()": "FitConfig(population=8, generations=2, refine_steps=3)"},
 }
 """Page -> what it computes -> what is computed here instead."""
-FILES = {
-    "docs/tutorial.md": ("pipelines/head/robot.py",),
-    "docs/guides/walk.md": ("pipelines/walker/__init__.py", "pipelines/walker/robot.py"),
-}
-"""Pages whose first blocks are files."""
+FILES = {"docs/tutorial.md": "pipelines/head/robot.py"}
+"""Pages whose first block is a file."""
 TRUE = {
     "README.md": [
         "model.verdict.status == 'accepted'",
@@ -85,7 +79,6 @@ TRUE = {
         "heights[0] < -0.5 and heights.max() > 0.9",  # pushing in the direction of motion swings it up
     ],
     "docs/guides/compose.md": ["task.arm.joints[0].full_identifier == 'arm/shoulder'"],
-    "docs/guides/import.md": ["len(episode.outputs['sensor']['th']) == len(episode.steps['sensor'].start) == 20_000"],
     "docs/guides/interop.md": ["robot.step_limit == 249"],
     "docs/guides/robot_computer.md": [
         "abs(features(Measurement(3.141592653589793)) - [-1.0, 0.0]).max() < 1e-6",
@@ -118,16 +111,9 @@ def test_the_python_of_a_page_runs(page, tmp_path, monkeypatch, request):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(jax, "device_put_replicated", None, raising=False)  # interop.md defines it, for all of JAX
     (tmp_path / "datasets").symlink_to(ROOT / "datasets")
-    if page == "docs/guides/import.md":
-        (tmp_path / "pipelines").symlink_to(ROOT / "pipelines")
-        np.savez(tmp_path / "disk_fit.npz", u=np.zeros(20_001), th=np.linspace(0.0, 1.0, 20_001))
-    for file, (_, text) in zip(FILES.get(page, ()), list(blocks), strict=False):
-        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / file).write_text(text)
-        del blocks[0]
-    if page == "docs/guides/walk.md":
-        shutil.copy(ROOT / "pipelines" / "go2" / "go2.xml", tmp_path / "pipelines" / "walker" / "walker.xml")
-        assert cli.main(["info", "walker"]) == 0
+    if file := FILES.get(page):
+        (tmp_path / file).parent.mkdir(parents=True)
+        (tmp_path / file).write_text(blocks.pop(0)[1])
     if page == "docs/tutorial.md":
         xml = (ROOT / page).read_text().split("```xml\n")[1].split("```")[0]
         (tmp_path / "pipelines" / "head" / "head.xml").write_text(xml)
@@ -135,10 +121,8 @@ def test_the_python_of_a_page_runs(page, tmp_path, monkeypatch, request):
     for number, block in blocks:
         for large, small in SMALLER.get(page, {}).items():
             block = block.replace(large, small)
-        if "runs/pendulum/TIME" in block or '"session.mcap"' in block:
-            run = request.getfixturevalue("finished_run_dir")
-            block = block.replace("runs/pendulum/TIME", str(run))
-            block = block.replace('"session.mcap"', repr(str(run / "record" / "session.mcap")))
+        if "runs/pendulum/TIME" in block:
+            block = block.replace("runs/pendulum/TIME", str(request.getfixturevalue("finished_run_dir")))
         exec(compile(block, f"{page}, block {number}", "exec"), names)
     assert [claim for claim in TRUE.get(page, ()) if not eval(claim, names)] == []
 
@@ -245,7 +229,7 @@ def test_links_and_paths_of_a_page_lead_to_files_and_headings(page):
             assert not anchor or path.suffix != ".md" or anchor in anchors(path), target
     if not page.stem.startswith("tutorial"):  # they name the reader's files
         paths = re.findall(r"`((?:sim2real|pipelines|scripts|tests|datasets|reports)/[\w/.*-]+\.\w+)`", text)
-        assert [path for path in paths if not (path.startswith("pipelines/walker/") or list(ROOT.glob(path)))] == []
+        assert [path for path in paths if not list(ROOT.glob(path))] == []
 
 
 def test_names_of_modules_classes_and_functions_on_pages_exist():

@@ -18,6 +18,7 @@ from sim2real.policy.contract import observation_size
 from sim2real.robots.walking.drive import gravity_of
 from sim2real.robots.walking.task import Commands
 from sim2real.robots.walking.twin import HiddenTwin, Twin, walk
+from sim2real.stages.load import load_robot
 
 ROOT = Path(__file__).parents[2]
 BUNDLE = ROOT / "pipelines/go2/walk"
@@ -88,6 +89,17 @@ def test_play_refuses_a_robot_that_does_not_walk(tmp_path):
     shutil.copytree(BUNDLE, bundle)
     with pytest.raises(UsageError, match="does not walk"):
         run(PlayConfig(str(bundle)))
+
+
+def test_a_copy_of_the_pipeline_under_another_name_is_a_robot(tmp_path, monkeypatch):
+    """As docs/guides/walk.md says."""
+    left = shutil.ignore_patterns("walk", "__pycache__")
+    shutil.copytree(ROOT / "pipelines/go2", tmp_path / "pipelines/walker", ignore=left)
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["info", "walker"]) == 0
+    robot = load_robot("walker")
+    assert robot.name == "walker"
+    assert Path(robot.mjcf).parent == tmp_path / "pipelines/walker"
 
 
 @pytest.mark.night
