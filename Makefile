@@ -14,18 +14,19 @@ demo: $(READY)
 	$(BIN)/sim2real demo
 
 # The gate. Types are checked beside the tests, in one thread: with two, pyright takes half as much processor time again.
-# Tests with real processes run alone, one after another; one that fails is repeated once.
+# Its priority is low, so that it ends beside the tests with real processes, which mostly wait. These run one after
+# another; one that fails is repeated once.
 PYTEST := $(BIN)/python -m pytest
 PROCESS := $(PYTEST) $$(grep -rl --include="*.py" mark.process tests) -m "process and not night"
 test: $(READY)
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/lint-imports --no-cache --no-logo
-	@$(BIN)/pyright > .venv/pyright.log 2>&1 & types=$$!; \
-	$(PYTEST) -m "not process and not night" --numprocesses 2 --dist loadfile --no-loadscope-reorder; tests=$$?; \
+	@nice -n 8 $(BIN)/pyright > .venv/pyright.log 2>&1 & types=$$!; \
+	$(PYTEST) -m "not process and not night" --numprocesses 2 --dist loadfile --no-loadscope-reorder && \
+	{ $(PROCESS) || $(PROCESS) --last-failed --last-failed-no-failures none; }; tests=$$?; \
 	wait $$types; types=$$?; echo "pyright:"; cat .venv/pyright.log; \
 	[ $$tests = 0 ] && [ $$types = 0 ]
-	$(PROCESS) || $(PROCESS) --last-failed --last-failed-no-failures none
 
 # What blocks nothing: long tests, those that depend on chance, and drawn examples from a new seed, on which no test ends
 # the others. SEED=N repeats a night.

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from sim2real.artifacts.files import read_json, write_json
 from sim2real.artifacts.posterior import Posterior
 from sim2real.identification.parameters import Parameter, ParameterTable
 
@@ -52,11 +51,3 @@ def test_a_direction_without_spread_is_no_problem(posterior):
     drawn = flat.sample(np.random.default_rng(0), 100)
     np.testing.assert_allclose(drawn["gain"], 3.0, rtol=1e-6)
     assert drawn["offset"].std() == pytest.approx(0.2, rel=0.3)
-
-
-def test_a_posterior_survives_a_file(posterior, tmp_path):
-    write_json(tmp_path / "posterior.json", posterior)
-    again = read_json(tmp_path / "posterior.json", Posterior)
-    drawn, expected = (p.sample(np.random.default_rng(0), 100) for p in (again, posterior))
-    for name, values in expected.items():
-        np.testing.assert_array_equal(drawn[name], values)

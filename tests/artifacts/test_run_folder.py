@@ -109,7 +109,7 @@ def test_a_stage_that_ends_while_it_is_read_did_not_die(tmp_path):
 
     reader = threading.Thread(target=read)
     reader.start()
-    for _ in range(20):
+    for _ in range(8):
         record(tmp_path)
     stop.set()
     reader.join()

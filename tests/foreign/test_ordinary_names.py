@@ -9,7 +9,7 @@ from sim2real.log.importing.importer import import_table
 from sim2real.log.importing.propose import ImportHints, propose
 from sim2real.log.importing.readers import open_tables
 
-T, GOAL, Q = motion(8.0)
+T, GOAL, Q = motion(8.0, dt=0.01)
 UNITS = {"rad": 1.0, "deg": 180 / np.pi, "rev": 0.5 / np.pi, "mrad": 1e3}
 TIMES = {
     "t": 1.0, "t_s": 1.0, "time": 1.0, "Time [s]": 1.0, "time_ms": 1e3, "timestamp": 1.0, "timestamp_us": 1e6,

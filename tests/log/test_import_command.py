@@ -1,7 +1,5 @@
-"""`sim2real import`: files in, logs out; and the mappings of the pipelines that come with public data sets."""
+"""`sim2real import`: files in, logs out."""
 
-import json
-import os
 from pathlib import Path
 
 import foreign_files
@@ -10,13 +8,10 @@ import pytest
 
 from sim2real import cli
 from sim2real.artifacts.run import newest
-from sim2real.log import import_file, read_log
+from sim2real.log import read_log
 from sim2real.view.sections import record_banner
 from sim2real.view.signals import Signals
 from sim2real.view.timing import timing_blocks, timing_tiles
-
-REPOSITORY = Path(__file__).resolve().parents[2]
-DATA = Path(os.environ.get("SIM2REAL_DATA", REPOSITORY.parent / "shared" / "data"))
 
 
 @pytest.fixture
@@ -94,53 +89,6 @@ def test_wrong_commands_exit_2_and_leave_no_run(workplace, capsys, arguments, na
     assert named in err
     assert not out
     assert not Path("runs").exists()
-
-
-def public(name):
-    """Return a file of the public data sets; without them the test is skipped."""
-    if not (DATA / name).exists():
-        pytest.skip(f"{DATA / name} is not there; SIM2REAL_DATA names the folder of the public recordings")
-    return DATA / name
-
-
-def imported(name, pipeline):
-    return import_file(public(name), REPOSITORY / "pipelines" / pipeline / "import.toml")
-
-
-def test_the_unbalanced_disk():
-    episode = imported("unbalanced_disk/disk_fit.npz", "disk")
-    assert episode.outputs["actuator"]["action"].shape == (30_000, 1)
-    assert episode.outputs["sensor"]["th"].shape == (30_000,)
-    assert episode.duration_s == 749.975
-    assert set(episode.metadata["stamps"].values()) == {"generated"}
-    assert episode.units == {"actuator": {"action": "V"}, "sensor": {"th": "rad"}}
-
-
-def test_bams_xl330():
-    name = "bam_xl330/2026-01-15_10h28m17.json"
-    episode = imported(name, "xl330")
-    entries = json.loads(public(name).read_text())["entries"]
-    ticks = [round(1e6 * entry["timestamp"]) for entry in entries]
-    for node in ("actuator", "sensor"):
-        np.testing.assert_array_equal(episode.steps[node].start, ticks)
-    commands, measured = episode.outputs["actuator"], episode.outputs["sensor"]
-    assert set(commands) == {"goal", "kp", "volts", "enabled"}
-    assert set(commands["kp"]) == {100.0}
-    assert set(commands["enabled"]) == {0.0, 1.0}
-    np.testing.assert_array_equal(measured["position"], [entry["position"] for entry in entries])
-    np.testing.assert_array_equal(measured["speed"], [entry["speed"] for entry in entries])
-    assert set(episode.metadata["stamps"].values()) == {"recorded"}
-
-
-def test_sages_so101(tmp_path):
-    name = "so101/single_joint_rotation.npz"
-    episode = imported(name, "so101_log")
-    with np.load(public(name)) as data:
-        np.testing.assert_array_equal(episode.outputs["actuator"]["goal"], data["cmd_rad"])
-        np.testing.assert_array_equal(episode.outputs["sensor"]["position"], data["q_rad"])
-        np.testing.assert_array_equal(episode.outputs["sensor"]["velocity"], data["dq_rad_s"])
-        np.testing.assert_array_equal(episode.steps["sensor"].start, np.rint(1e6 * data["t_meas_s"]))
-    assert episode.outputs["sensor"]["position"].shape == (5200, 6)
 
 
 def test_a_mapping_cannot_lead_out_of_the_folder_of_runs(tmp_path, capsys):

@@ -7,7 +7,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from recorded_robots import RecordedRobotConformance, episode, predictions, public, rmse
-from scipy.optimize import least_squares
 
 from sim2real.identification.fit import fit
 from sim2real.identification.residuals import Problem
@@ -147,19 +146,3 @@ def test_a_real_disk_is_foretold_over_two_minutes(free_run):
     assert t[-1] > 124.5
     assert rmse(measured) > 0.4
     assert rmse(model - measured) < 0.025
-
-
-@pytest.mark.night
-def test_so_does_a_loop_of_our_own(recording, free_run):
-    _, measured, model = free_run
-    voltage, read = recording.outputs["actuator"]["action"][:, 0], recording.outputs["sensor"]["th"]
-    past = slice(PAST - SETTLE, PAST)
-
-    def off(start):
-        return encoder(GOOD, simulated(GOOD, voltage[past], start)) - read[past]
-
-    start = least_squares(off, [read[past.start] - GOOD["offset"], 0.0], diff_step=1e-4).x
-    # The state is fitted to samples up to the end of settling, that at the end itself included.
-    own = encoder(GOOD, simulated(GOOD, voltage[past.start :], start))[SETTLE + 1 :][: len(measured)]
-    assert rmse(own - measured[:, 0]) < 0.025
-    assert rmse(own - model[:, 0]) < 0.012

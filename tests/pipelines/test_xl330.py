@@ -124,17 +124,3 @@ def test_a_real_servo_is_foretold_at_a_gain_that_was_not_fitted(whole):
     assert [len(t) > 1000 for t, _, _ in whole] == [True] * 4
     assert np.mean([np.abs(measured).mean() for _, measured, _ in whole]) > 0.3
     assert np.mean([np.abs(model - measured).mean() for _, measured, model in whole]) < 0.030
-
-
-@pytest.mark.night
-def test_so_does_a_loop_of_our_own(recordings, whole):
-    """From the model's own start: where it was measured, at rest."""
-    errors = []
-    for log, (t, measured, model) in zip(recordings, whole, strict=True):
-        stamps, given = log.steps["sensor"].start * 1e-6, log.outputs["actuator"]
-        start = (log.outputs["sensor"]["position"][0], 0.0)
-        own = simulated(GOOD, stamps, given["goal"], given["kp"], given["enabled"], start, READ_LATE_S)
-        own = np.interp(t, stamps, own)
-        errors.append(np.abs(own - measured[:, 0]).mean())
-        assert rmse(own - model[:, 0]) < 0.003
-    assert np.mean(errors) < 0.030

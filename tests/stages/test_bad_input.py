@@ -1,7 +1,6 @@
 """Bad input: each a clear error with a hint and its exit code, and no traceback."""
 
 import json
-import os
 
 import pytest
 
@@ -107,23 +106,6 @@ def test_ports_that_are_none(fails, tmp_path, port):
     assert port in fails(errors.HARDWARE_LOST, "record", "pendulum", "--port", port, "--runs", tmp_path)
     (manifest,) = tmp_path.glob("pendulum/*/record/manifest.json")
     assert json.loads(manifest.read_text())["exit_code"] == errors.HARDWARE_LOST
-
-
-def test_a_port_without_a_servo(fails, tmp_path):
-    host, device = os.openpty()
-    try:
-        said = fails(errors.HARDWARE_LOST, "record", "pendulum", "--port", os.ttyname(device), "--runs", tmp_path)
-    finally:
-        os.close(host)
-        os.close(device)
-    assert "servo 1 does not answer" in said
-
-
-def test_run_folders_that_cannot_be_written(fails, tmp_path):
-    (tmp_path / "file").write_text("")
-    said = fails(errors.ERROR, "record", "pendulum", "--runs", tmp_path / "file")
-    assert "cannot write the run folder" in said
-    assert "--runs DIR" in said
 
 
 @pytest.mark.parametrize(
