@@ -11,17 +11,17 @@ from typing import Any
 
 from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.deployment import Deployment, Drift
-from sim2real.artifacts.identification import ROUND_TRIP, Identification
+from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.iterations import Iteration, iterations, iterations_table
 from sim2real.artifacts.paths import shown
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run import STAGES, StageFolder, finished, stage_status
 from sim2real.artifacts.summary import Shown
 from sim2real.commands.stages import RunFlags, module_of
-from sim2real.errors import DelayChanged, Sim2RealError, UsageError
+from sim2real.errors import DelayChanged, UsageError
 from sim2real.robots.robot import RecordedRobot
 from sim2real.stages.config import DeployConfig, IdentifyConfig, RecordConfig, TrainConfig
-from sim2real.stages.deploy.verdict import logs_to_identify, terms_to_identify
+from sim2real.stages.deploy.verdict import terms_to_identify
 from sim2real.stages.load import AnyRobot, defaults_of, robot_of, shipped_policy
 from sim2real.stages.shared.arguments import AnyPath, config_of, folder_of
 from sim2real.stages.shared.find_run import find_run
@@ -82,15 +82,13 @@ class Plan:
     """The stages to run next, in order; none if the run stops.
 
     Attributes:
-        words: The plan, or why the run stops, as text.
-        log: The logs to identify from; empty for the newest recording.
+        why: Why the run stops.
         terms: The optional terms to identify with; None for the flags' value.
         seed: The seed of the training; None for the flags' value.
     """
 
     stages: tuple[str, ...]
-    words: str
-    log: tuple[str, ...] = ()
+    why: str = ""
     terms: str | None = None
     seed: int | None = None
 
@@ -117,20 +115,20 @@ class _Iterating:
                 "a dry deployment moves nothing, so no iteration follows from it", hint="run without --deploy.dry-run"
             )
         refusal, rows = None, list[Iteration]()
-        plan = Plan(STAGES, ", ".join(STAGES)) if run_dir is None else self._plan(run_dir, resumed=True)
+        plan = Plan(STAGES) if run_dir is None else self._plan(run_dir, resumed=True)
         while plan.stages:
             refusal = None
             for stage in plan.stages:
                 note(f"{stage} (iteration {len(rows) + 1})")
                 try:
-                    run_dir = self._stage(stage, self._config(plan, stage), run_dir).run_dir
+                    run_dir = self.call(stage, self._config(plan, stage), run_dir).run_dir
                 except DelayChanged as error:
                     refusal = error
                     break
             if run_dir is None:
                 raise refusal or UsageError("this run has no folder, because no stage ran")
             plan, rows = self._plan(run_dir), iterations(run_dir)
-            note(f"iteration {len(rows)}: {rows[-1].verdict}; {plan.words}")
+            note(f"iteration {len(rows)}: {rows[-1].verdict}; {plan.why or ', '.join(plan.stages)}")
         if refusal is not None:
             raise refusal
         assert run_dir is not None  # only a plan for a run that exists has no stages
@@ -147,108 +145,51 @@ class _Iterating:
         rows, status = iterations(run_dir), stage_status(run_dir)
         lacking = tuple(s for s in STAGES if s not in status or status[s].stale)
         if not rows:
-            return Plan(lacking, ", ".join(lacking))
-        last = rows[-1]
-        drift = None if last.refused else Deployment.read(last.deployment.folder).drift
+            return Plan(lacking)
+        last, drift, stages = rows[-1], None, STAGES
         # A recording that is older than the refusal of a policy shows another robot.
         recorded = status["record"].newest.manifest.started if "record" in status else ""
-        if last.refused and recorded < last.deployment.manifest.started:
-            plan = self._anew(run_dir, STAGES, drift)
-        elif lacking and resumed:
-            # The run was interrupted, or a stage was made by hand. An identification from named logs may not suffice.
-            known = status.get("identify")
-            if lacking[0] == "train" and known is not None and (known.newest.manifest.config or {}).get("log"):
-                lacking = STAGES if _why_insufficient(self._newest_identification(run_dir)) else lacking
-            return self._anew(run_dir, lacking, drift)
-        else:
-            plan = self._after(run_dir, last.deployment)
-        if plan.stages and len(rows) >= self.flags.iterations:
-            return Plan((), f"the last iteration: it would {plan.words}")
-        return plan
+        if not (last.refused and recorded < last.deployment.manifest.started):
+            deployment = None if last.refused else Deployment.read(last.deployment.folder)
+            drift = None if deployment is None else deployment.drift
+            if lacking and resumed:  # the run was interrupted, or a stage was made by hand
+                return self._again(run_dir, lacking, drift)
+            if deployment is not None and (why := _why_stopped(deployment)):
+                return Plan((), f"stop: {why}")
+            # Train alone if the model holds, and the timing of the training does, too. Otherwise record: the motion of
+            # a policy may not separate a delay from inertia.
+            if deployment is not None and deployment.verdict and deployment.verdict.stages == ("train",):
+                stages = ("train", "deploy")
+        if len(rows) >= self.flags.iterations:
+            return Plan((), f"the last iteration: next would be {', '.join(stages)}")
+        return self._again(run_dir, stages, drift)
 
-    def _after(self, run_dir: Path, folder: StageFolder) -> Plan:
-        """Return the plan that follows from the newest deployment."""
-        deployment = Deployment.read(folder.folder)
-        # Stop if the policy works, or if no stage can improve the result.
-        verdict = deployment.verdict
-        if verdict is None or verdict.status in ("look at this joint", "not judged"):
-            return Plan((), f"stop: {next(iter(deployment.reasons), 'the deployment was not judged')}")
-        if verdict.status == "fine":
-            return Plan((), "stop: the policy works on the robot")
-        # Train again if the model holds and the timing of the training does, too.
-        seed = self._next_seed(run_dir)
-        if verdict.stages == ("train",):
-            return Plan(("train", "deploy"), "train with another seed, deploy", seed=seed)
-        # Otherwise identify from the deployment's logs, or record first if they are too short.
-        identification = self._newest_identification(run_dir)
-        outputs = sorted(folder.outputs.items())
-        deployed = [path for name, path in outputs if name.startswith("log_") or name == "probe"]
-        logs = logs_to_identify(deployed, deployment.drift, identification, folder.folder)
-        if not logs:
-            return self._anew(run_dir, STAGES, deployment.drift)
-        terms = terms_to_identify(self.flags.identify.terms, self.robot, identification, deployment.drift)
-        words = f"identify from {len(logs)} log{'s' * (len(logs) > 1)}, the deployment's among them, train, deploy"
-        return Plan(("identify", "train", "deploy"), words, logs, terms, seed)
-
-    def _anew(self, run_dir: Path, stages: tuple[str, ...], drift: Drift | None) -> Plan:
-        """Return the plan to run stages from new recordings, with the terms of the newest identification."""
-        words = ", ".join(stages)
-        if finished(run_dir, "identify") is None:
-            return Plan(stages, words)
-        known = self._newest_identification(run_dir)
+    def _again(self, run_dir: Path, stages: tuple[str, ...], drift: Drift | None) -> Plan:
+        """Return the plan to run stages with the terms of the newest identification, and another seed."""
+        identified, trained = finished(run_dir, "identify"), finished(run_dir, "train")
+        if identified is None:
+            return Plan(stages)
+        known = Identification.load(identified.output("parameters"))
         terms = terms_to_identify(self.flags.identify.terms, self.robot, known, drift)
-        return Plan(stages, words, terms=terms, seed=self._next_seed(run_dir))
+        # The same seed would train the same policy.
+        seed = self.flags.train.seed if trained is None else 1 + int(trained.manifest.config["seed"])
+        return Plan(stages, terms=terms, seed=seed)
 
     def _config(self, plan: Plan, stage: str) -> Any:
         """Return the configuration of a stage: that of the flags, with the changes of the plan."""
         if stage == "identify" and plan.terms is not None:
-            return replace(self.flags.identify, log=plan.log, terms=plan.terms)
+            return replace(self.flags.identify, log=(), terms=plan.terms)
         if stage == "train" and plan.seed is not None:
             return replace(self.flags.train, seed=plan.seed)
         return getattr(self.flags, stage)
 
-    def _stage(self, stage: str, config: Any, run_dir: Path | None) -> StageFolder:
-        """Run a stage; record first where the logs of a deployment do not suffice to identify from.
 
-        A policy that holds still excites no parameter; one that balances amplifies errors a hundredfold.
-        """
-        if stage != "identify" or not config.log:
-            return self.call(stage, config, run_dir)
-        try:
-            folder = self.call(stage, config, run_dir)
-            if not (reason := _why_insufficient(Identification.load(folder.output("parameters")))):
-                return folder
-        except DelayChanged:
-            raise
-        except Sim2RealError as error:
-            reason = str(error.args[0])
-        note(f"the deployment's own logs do not suffice ({reason}): record, identify from that")
-        recorded = self.call("record", self.flags.record, run_dir)
-        return self.call("identify", replace(config, log=()), recorded.run_dir)
-
-    def _newest_identification(self, run_dir: Path) -> Identification:
-        folder = finished(run_dir, "identify")
-        if folder is None:
-            raise Sim2RealError("this run has no identification", hint=f"sim2real identify {self.robot.name}")
-        return Identification.load(folder.output("parameters"))
-
-    def _next_seed(self, run_dir: Path) -> int:
-        """Return the seed after that of the newest training: the same seed would train the same policy."""
-        training = finished(run_dir, "train")
-        return 1 + int(training.manifest.config["seed"]) if training is not None else self.flags.train.seed
-
-
-def _why_insufficient(identification: Identification) -> str:
-    """Return why the logs of a deployment do not suffice to identify from; "" if they do.
-
-    The motion of a policy may not separate a delay from inertia, and a delay of 0 is accepted.
-    """
-    if identification.verdict.status != "accepted":
-        return identification.verdict.status
-    round_trip = next((p for p in identification.parameters if p.name == ROUND_TRIP), None)
-    if round_trip is None or round_trip.verdict in ("ok", "fixed"):
-        return ""
-    return f"the round trip delay is {round_trip.verdict}"
+def _why_stopped(deployment: Deployment) -> str:
+    """Return why no stage can improve the result of a deployment; "" if one can."""
+    verdict = deployment.verdict
+    if verdict is None or verdict.status in ("look at this joint", "not judged"):
+        return next(iter(deployment.reasons), "the deployment was not judged")
+    return "the policy works on the robot" if verdict.status == "fine" else ""
 
 
 # -- for Python
