@@ -9,7 +9,7 @@ from foreign_robots import MODEL, VENDOR, csv, imported, motion, proposed
 from sim2real import cli
 from sim2real.errors import UsageError
 from sim2real.log import import_file, load_mapping, read_log
-from sim2real.log.importing.names import columns_of, is_unit, meaning
+from sim2real.log.importing.names import columns_of, meaning
 from sim2real.log.importing.propose import ImportHints, propose
 from sim2real.log.importing.readers import joined, open_tables
 
@@ -228,9 +228,3 @@ def test_which_of_two_commands_is_asked(tmp_path):
 def test_meanings(name, found):
     m = meaning(name)
     assert (m.side, m.quantity, m.unit, m.label) == found
-
-
-def test_units_of_a_second_line():
-    assert is_unit("[rad/s]")
-    assert not is_unit("speed")
-    assert not is_unit("")

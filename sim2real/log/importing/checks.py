@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -121,10 +121,9 @@ def check(
     if any(f.weight == "refuse" for f in clock):
         findings = [f for f in findings if f.name not in ("follows", "lag")]
     elif moving and not following and not any(f.weight in ("refuse", "ask") for f in findings):
-        # The cause is told first.
-        told = [*(f.text for f in rates), "no position follows its goal: units, signs, order and clocks are unproven"]
-        text = "; ".join(told)
-        findings.append(Check("follows", -1, text, "ask"))
+        rates = [replace(f, weight="refuse") for f in rates]  # the cause
+        text = "no position follows its goal: units, signs, order and clocks are unproven"
+        findings += [] if rates else [Check("follows", -1, text, "ask")]
     findings += clock
     if following:
         late = ", ".join(f"{names[i]} {1e3 * lag_s[i]:.0f} ms" for i in following[:6])

@@ -16,7 +16,7 @@ from sim2real.installation import version
 from sim2real.log.importing import checks
 from sim2real.log.importing.mapping import STAMP_UNITS, ImportMapping, NodeMapping, in_si, load_mapping
 from sim2real.log.importing.names import meaning
-from sim2real.log.importing.readers import Table, open_tables
+from sim2real.log.importing.readers import Table, open_table
 from sim2real.log.writer import SessionFile
 from sim2real.types import Json
 
@@ -53,10 +53,7 @@ def import_file(
             differ in length, a gain lacks most of its numbers, a position jumps, or stamps do not increase.
     """
     chosen = mapping if isinstance(mapping, ImportMapping) else load_mapping(mapping)
-    tables = open_tables(Path(path), episode)
-    if len(tables) > 1:
-        raise UsageError(f"{path} holds {len(tables)} episodes", hint="choose one: episode=0")
-    return import_table(tables[0], chosen, samples)
+    return import_table(open_table(Path(path), episode), chosen, samples)
 
 
 @np.errstate(over="ignore", invalid="ignore")  # damaged files hold numbers of any size
@@ -330,13 +327,11 @@ def _is_position(field: str) -> bool:
 
 def _cut(table: Table, nodes: Mapping[str, _Node], samples: slice) -> int:
     """Select a range of samples; return the first."""
-    if samples.step not in (None, 1):
-        raise UsageError(f"a range of samples has no step, got {samples.step}", hint="remove the step")
     counts = {name: len(node.rows) for name, node in nodes.items()}
-    if len(set(counts.values())) > 1:
+    if samples.step not in (None, 1) or len(set(counts.values())) > 1:
         listed = ", ".join(f"{name} {count}" for name, count in counts.items())
         raise UsageError(
-            f"the nodes differ in their number of samples, so a range of samples is no range of time: {listed}",
+            f"a range of samples is no range of time: it has a step, or nodes differ in their samples: {listed}",
             hint="import all samples, and cut the file itself",
         )
     # Check the limits, as a slice would accept any number.

@@ -152,12 +152,6 @@ def about_torque(mapping: Mapping[str, Mapping[str, Json]]) -> list[str]:
     ]
 
 
-def is_unit(text: str) -> bool:
-    """Return whether a text is a unit, such as ``rad/s``, ``[deg]`` or ``N m``."""
-    words = [w.lower() for w in re.findall(r"[A-Za-z%]+", text)]
-    return bool(words) and all(w in _UNIT or w in ("n", "m", "nm", "a", "v", "%", "kg", "per") for w in words)
-
-
 # -- joints
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -179,7 +179,7 @@ class Proposal:
                     refusal = UsageError(f"{self.table.path}: {odd[0].text}", hint=checks.hint_for(odd))
                 if unproven is None:
                     raise refusal from None
-                self.ask_unit(unproven, f"{refusal.args[0]}{' --joints names the other joints' * bool(odd)}")
+                self.ask(unproven, "unit", f"{refusal.args[0]}{' --joints names the other joints' * bool(odd)}")
                 return
             source = episode.metadata["source"]
             for node, counts in source["dropped"].items():
@@ -209,6 +209,8 @@ class Proposal:
         choices = unlike or [s for s in series if s.meaning.quantity in ("", "position")]
         if other is not None:  # the likeliest first
             choices.sort(key=lambda s: (set(s.labels) != set(other.labels), s.width != other.width))
+        if not choices and (longest := max((len(s.values) for s in self.signals), default=0)) < 3:
+            raise UsageError(f"{self.table.path} has {longest} samples", hint="check that the file is complete")
         if not choices:
             raise UsageError(
                 f"{self.table.path} has no {'measured positions' if side == 'measured' else 'commands'}. Columns: "
@@ -477,13 +479,10 @@ class Proposal:
         Args:
             asked: Node and field whose unit is open where no position follows its goal.
         """
-        open_ones = [f for f in findings if f.weight in ("ask", "refuse")]
-        told = [f for f in findings if f.weight == "warn" and not any(f.text in other.text for other in open_ones)]
-        told += open_ones if self.hints.as_told else []
-        self.evidence += [f.text for f in findings if f.weight == "note"]
-        self.evidence += [f"warning: {f.text}" for f in told]
-        if self.hints.as_told:
-            return
+        as_told = self.hints.as_told
+        told = [f for f in findings if f.weight == "warn" or (as_told and f.weight != "note")]
+        self.evidence += [f.text for f in findings if f.weight == "note"] + [f"warning: {f.text}" for f in told]
+        open_ones = [f for f in findings if f.weight in ("ask", "refuse") and not as_told]
         # One line of the mapping answers these; the others are wrong in the file.
         # A joint of another scale than the others is refused by its name; if all are, their unit is open.
         followed = any(f.name == "follows" and f.weight == "note" for f in findings)
@@ -491,29 +490,28 @@ class Proposal:
         if wrong:
             text = "; ".join(f.text for f in wrong)
             raise UsageError(f"{self.table.path}: {text}", hint=checks.hint_for(wrong))
-        if (goal := self.fields["actuator"].get("goal")) is None:
-            return
         for key in dict.fromkeys(f.question for f in open_ones):
             those = [f for f in open_ones if f.question == key]
             why = "; ".join(f.text for f in those)
             if self.hints.unit and all(f.name == "follows" for f in those):
                 self.evidence.append(f"warning: {why}")  # --unit has answered
-            elif key == "unit":
-                self.ask_unit(asked, f"{why}; --as-told keeps it")
-            elif key == "scale":
-                scale = np.broadcast_to(goal.scale, (len(self.joints),)).tolist()
-                turned = [-x if i in {f.joint for f in those} else x for i, x in enumerate(scale)]
-                self.questions["actuator", "goal", key] = f"{turned} or {scale}?  # {why}; --as-told keeps the file's"
             else:
-                listed = json.dumps(goal.sources)
-                self.questions["actuator", "goal", key] = (
-                    f"{listed} in another order?  # {why}; --as-told keeps the file's"
-                )
+                self.ask(asked if key == "unit" else ("actuator", "goal"), key, why, {f.joint for f in those})
 
-    def ask_unit(self, at: tuple[str, str], why: str) -> None:
-        """Ask for a unit that the data do not prove."""
-        unit = self.mapping.nodes[at[0]].fields[at[1]].unit
-        self.questions[(*at, "unit")] = f'"{unit}" or another?  # {why}; --unit answers, too'
+    def ask(self, at: tuple[str, str], key: str, why: str, joints: Collection[int] = ()) -> None:
+        """Ask for a line of a field that the data do not prove.
+
+        Args:
+            joints: Numbers of the joints that it concerns.
+        """
+        how = self.mapping.nodes[at[0]].fields[at[1]]
+        scale = np.broadcast_to(how.scale, (len(self.joints),)).tolist()
+        answers = {
+            "unit": f'"{how.unit}" or another?  # {why}; --unit answers, too',
+            "scale": f"{[-x if i in joints else x for i, x in enumerate(scale)]} or {scale}?  # {why}",
+            "source": f"{json.dumps(how.sources)} in another order?  # {why}",
+        }
+        self.questions[(*at, key)] = f"{answers[key]}; --as-told keeps the file's"
 
 
 def _rank(named: Meaning, side: str) -> int | None:
@@ -606,15 +604,14 @@ def joint_motion(table: Table, joints: Sequence[str], unit: str) -> tuple[np.nda
             hint=f"name them by joint, quantity and unit, such as {joints[0]}_goal_rad, and the time t_s",
         )
     signal = min(motions, key=lambda s: (s.meaning.side != "command", s.meaning.quantity != "position"))
-    _, t_s = of.clock(signal, "motion")
-    own = of.unit(signal)[0] if unit == "rad" else unit
-    if not own:
+    clock, _ = of.clock(signal, "motion")
+    own = of.unit(signal)[0] if unit == "rad" else ""
+    if unit == "rad" and not own:
         of.questions["motion", "", "unit"] = f"of {signal.name}: rad or deg? End the names with it"
     if of.questions:
         text = "; ".join(of.questions.values())
         raise UsageError(f"{table.path}: {text}", hint="name columns t_s, JOINT_goal_rad")
-    rows = np.flatnonzero(np.isfinite(t_s) & np.isfinite(signal.values).all(axis=1))
-    if len(rows) < 2:
-        raise UsageError(f"{signal.name!r} in {table.path} has no rows that hold numbers for all joints")
-    scale = in_si(own)[0] if unit == "rad" else 1.0
-    return t_s[rows], scale * signal.values[rows], f"{signal.name} of {table.path.name}"
+    node = NodeMapping({"motion": signal.mapped(own)}, **clock)
+    episode = import_table(table, ImportMapping("motion", {"motion": node}))
+    values = episode.outputs["motion"]["motion"].reshape(-1, len(joints))
+    return episode.steps["motion"].begun_s, values, f"{signal.name} of {table.path.name}"

@@ -18,7 +18,6 @@ from pathlib import Path
 import numpy as np
 
 from sim2real.errors import UsageError
-from sim2real.log.importing.names import is_unit
 from sim2real.types import Json
 
 _NULL = frozenset(("", "nan", "null", "none", "n/a", "na", "nil", "-", "--", "?"))
@@ -194,7 +193,7 @@ def open_tables(path: Path, episode: int | None = None) -> list[Table]:
         return [bags.read_bag(path)]
     if head[:2] == b"PK":
         return [_read_npz(path)]
-    if b"\0" in head:
+    if re.search(rb"[\0-\x08\x0e-\x1a]", head):
         is_utf_16 = head[:2] in (b"\xff\xfe", b"\xfe\xff") or head[1::2].count(0) > len(head) // 4
         raise UsageError(
             f"{path} is {'UTF-16 text' if is_utf_16 else 'binary'}, which import does not read",
@@ -206,6 +205,14 @@ def open_tables(path: Path, episode: int | None = None) -> list[Table]:
     except UnicodeDecodeError:  # such as the degree sign of a program on Windows
         text = data.decode("cp1252", errors="replace")
     return [_read_json(path, text) if text.lstrip()[:1] in ("{", "[") else _read_csv(path, text)]
+
+
+def open_table(path: Path, episode: int | None = None) -> Table:
+    """Read a file that holds one recording; see ``open_tables``."""
+    tables = open_tables(path, episode)
+    if len(tables) > 1:
+        raise UsageError(f"{path} holds {len(tables)} episodes", hint=f"sim2real import {path} makes logs of them")
+    return tables[0]
 
 
 def refuse_container(path: Path, head: bytes) -> None:
@@ -327,23 +334,16 @@ def _is_unclear(data: Sequence[tuple[int, list[str]]], width: int, is_nameless: 
 
 def _names(above: Sequence[tuple[int, str]], separator: str | None, width: int) -> tuple[list[str] | None, int]:
     """Return the names of the columns, None without any, and the number of their line."""
-    units: tuple[list[str], int] | None = None
     for i, line in reversed(above):
         text = _COMMENT.sub("", line, count=1) if _COMMENT.match(line) else line
         # The line of names may be separated in another way than the numbers.
         split = [[c.strip() for c in _cells(text, by)] for by in (separator, ",", None)]
         cells = next((cells for cells in split if len(cells) == width and any(cells)), None)
-        if cells is None:
-            # A line of another width is text, and above it there are no names.
-            if not _COMMENT.match(line):
-                break
-        elif units is None and len(above) > 1 and all(not c or is_unit(c) for c in cells):
-            units = cells, i
-        elif units is None:
+        if cells is not None:
             return cells, i
-        else:
-            return [f"{name} [{unit}]" if unit else name for name, unit in zip(cells, units[0], strict=True)], i
-    return units or (None, 0)
+        if not _COMMENT.match(line):  # a line of another width is text, and above it there are no names
+            break
+    return None, 0
 
 
 def numbers(texts: Sequence[str]) -> np.ndarray | str | None:

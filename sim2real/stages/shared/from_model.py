@@ -14,7 +14,7 @@ from sim2real.graph.episode import Episode
 from sim2real.log.importing.bags import is_ours
 from sim2real.log.importing.importer import import_table
 from sim2real.log.importing.mapping import ImportMapping, load_mapping
-from sim2real.log.importing.readers import Table, open_tables
+from sim2real.log.importing.readers import open_table
 from sim2real.log.reader import read_log
 from sim2real.robots.model import file as model_file
 from sim2real.robots.model.drives import joints_of
@@ -75,14 +75,14 @@ def describe_robot(flags: RobotFlags, logs: Sequence[str]) -> Described:
         name = str(episode.metadata.get("pipeline") or name)
     elif flags.mapping is not None:
         mapping = _of_joints(load_mapping(flags.mapping, name))
-        episode = import_table(_table(first), mapping)
+        episode = import_table(open_table(first), mapping)
         import_logs_stage.refuse_contradictions(first, episode, flags.as_told)
     else:
         hints = import_logs_stage.hints_of_model(
             flags.mjcf, name, flags.joints, flags.rate_hz, as_told=flags.as_told, unit=flags.unit or ""
         )
-        mapping, _ = import_logs_stage.proposed(_table(first), hints)
-        episode = import_table(_table(first), mapping)
+        mapping, _ = import_logs_stage.proposed(open_table(first), hints)
+        episode = import_table(open_table(first), mapping)
     # Describe the robot by the first log.
     description = _description(flags, model, episode)
     note_held(description)
@@ -97,13 +97,6 @@ def _of_joints(mapping: ImportMapping) -> ImportMapping:
         for name, n in mapping.nodes.items()
     }
     return replaced(mapping, nodes=nodes)
-
-
-def _table(path: Path) -> Table:
-    tables = open_tables(path)
-    if len(tables) > 1:
-        raise UsageError(f"{path} holds {len(tables)} episodes", hint=f"sim2real import {path} makes logs of them")
-    return tables[0]
 
 
 def note_held(description: RobotConfig) -> None:
