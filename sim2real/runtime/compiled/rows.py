@@ -53,7 +53,8 @@ class RowProgram:
         self.nodes, self.wiring, self.episodes = nodes, wiring, episodes
         self.bounds: DelayBounds = bounds_of(nodes)
         # Shape (R, E, ...): the entries of one row, which all copies look up at once, are adjacent in memory.
-        by_row = lambda t: jnp.asarray(t.swapaxes(0, 1))  # noqa: E731
+        # On the device without a compilation, which `jnp.asarray` makes for each shape.
+        by_row = lambda t: jax.device_put(t.swapaxes(0, 1))  # noqa: E731
         self._tables = jax.tree_util.tree_map(by_row, [_pytree(t) for t in wiring.tables])
         self._world = jax.tree_util.tree_map(by_row, _pytree(wiring.world_table))
         self._always = [bool((t.seq >= 0).all()) and not reusable for t in wiring.tables]

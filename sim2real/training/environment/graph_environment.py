@@ -80,7 +80,7 @@ class GraphEnvironment(TrainingEnvironment):
 
         # The row of an episode's last step is not played: its observation is the final one.
         counts = graph.timeline.vertices[graph.supervisor].count if steps is None else steps
-        self._last = jnp.asarray(graph.last_row(np.asarray(counts)), jnp.int32)
+        self._last = jax.device_put(graph.last_row(np.asarray(counts)).astype(np.int32))
         self._data: PyTree = None
 
         # jit, so that each is traced only once for all its uses: tracing MuJoCo's worlds takes 5 s.

@@ -105,12 +105,12 @@ def shardings_of(state: TrainState, config: PPOConfig) -> Shardings | None:
 
 def place(state: T, layout: Shardings | None) -> T:
     """Return a state on its devices; each process, which has the whole state in memory, puts its own part."""
-    return state if layout is None else jax.tree.map(_put, state, layout.state)
+    return jax.device_put(state) if layout is None else jax.tree.map(_put, state, layout.state)
 
 
 def replicate(tree: T, layout: Shardings | None) -> T:
     """Return arrays with a copy on every device, from arrays in this process's memory."""
-    return jax.tree.map(jnp.asarray if layout is None else lambda leaf: _put(leaf, layout.whole), tree)
+    return jax.device_put(tree) if layout is None else jax.tree.map(lambda leaf: _put(leaf, layout.whole), tree)
 
 
 def _put(leaf: Array, where: NamedSharding) -> jax.Array:
