@@ -4,13 +4,14 @@ import subprocess
 import sys
 
 import pytest
+from families import VOLTS
 
 from sim2real.emulation.truth import Kind, TruthLog, read_truth
 from sim2real.errors import Sim2RealError
 
 
-def test_the_account_of_a_robot_can_be_cut_anywhere(start_robot, tmp_path):
-    robot = start_robot(ids=[1, 2], time_constant_s=0.03)
+def test_the_account_of_a_robot_can_be_cut_anywhere(tmp_path):
+    robot = VOLTS.robot(ids=[1, 2], time_constant_s=0.03)
     robot.sleep(0.8)
     truth = robot.truth()
     assert truth.parameters == {"time_constant_s": 0.03, "top_speed_rad_s": 6.0}

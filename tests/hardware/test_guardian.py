@@ -9,10 +9,9 @@ import sys
 
 import numpy as np
 import pytest
+from families import IDS, VOLTS
 
-from sim2real.emulation.dynamixel import EmulatorConfig
 from sim2real.emulation.truth import Kind
-from sim2real.hardware import dynamixel as reg
 from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.safety import guardian
 from sim2real.hardware.safety.guardian import BEAT, REST, Guard, Motors
@@ -46,38 +45,44 @@ def test_a_robot_whose_torque_was_off_may_have_another_master(last, acts):
         assert all(reason in text for reason, text in zip(acts, told, strict=True))
 
 
-def test_silence_is_allowed_while_torque_is_off_and_the_port_is_free_afterwards(start_robot, open_servos):
-    robot = start_robot()
-    device = open_servos(robot, silence_s=0.1)
-    device.disable()
-    robot.stall(0.3)
-    device.enable()
-    device.command(np.array([2.5]))
-    device.close()
+def test_silence_is_allowed_while_torque_is_off_and_the_port_is_free_afterwards():
+    robot = VOLTS.robot()
+    with VOLTS.device(robot, silence_s=0.1) as device:
+        device.enable()
+        device.disable()
+        robot.stall(0.3)
+        device.enable()
+        device.command(np.full(3, 2.5))
     assert robot.reports == []
-    assert open_servos(robot).link.read(1, reg.TORQUE_ENABLE) == 1
+    with VOLTS.device(robot) as device:
+        device.enable()
+        assert VOLTS.on(robot) == list(IDS)
 
 
-def test_it_says_nothing_on_the_bus_while_all_is_well(start_robot, open_servos):
-    robot = start_robot()
-    device = open_servos(robot)
-    opened_ns, before = robot.now_ns(), device.counters.transactions
-    for _ in range(50):
-        device.measure()
-        robot.sleep(0.005)
-    done_ns, asked = robot.now_ns(), device.counters.transactions - before
-    device.close()
+def test_it_says_nothing_on_the_bus_while_all_is_well():
+    robot = VOLTS.robot()
+    with VOLTS.device(robot, silence_s=1.0) as device:
+        device.enable()
+        opened_ns, before = robot.now_ns(), device.counters.transactions
+        for _ in range(50):
+            device.measure()
+            robot.sleep(0.005)
+        done_ns, asked = robot.now_ns(), device.counters.transactions - before
     rows = robot.truth().rows
     inside = (rows["t_ns"] > opened_ns) & (rows["t_ns"] < done_ns)
-    assert np.count_nonzero(np.isin(rows["kind"][inside], (Kind.SAMPLE, Kind.REPLY))) == asked == 50
+    replies = np.count_nonzero(np.isin(rows["kind"][inside], (Kind.SAMPLE, Kind.REPLY)))
+    assert (replies, asked) == (50 * len(IDS), 50)
 
 
-def test_without_it_a_servo_that_only_notices_goes_on_when_its_host_dies(start_robot, open_servos):
+def test_without_it_a_servo_that_only_notices_goes_on_when_its_host_dies():
     """An XL330: docs/guides/safety.md says so."""
-    robot = start_robot(config=EmulatorConfig(model_number=1200))
-    open_servos(robot, silence_s=0.2, guardian=False).command(np.array([3.5]))
+    robot = VOLTS.robot(settings={"model_number": 1200})
+    device = VOLTS.device(robot, silence_s=0.2, guardian=False)
+    device.open()
+    device.enable()
+    device.command(np.full(3, 3.5))
     robot.kill_host()
     robot.sleep(1.0)
     truth = robot.truth()
-    assert truth.of(Kind.WATCHDOG).size == 1
+    assert truth.of(Kind.WATCHDOG).size == len(IDS)
     assert truth.of(Kind.EFFECT)["values"][-1, :2].tolist() == [OperatingMode.PWM, pytest.approx(0.7, abs=1e-3)]

@@ -2,31 +2,22 @@
 
 import numpy as np
 import pytest
+from families import VOLTS
 
 from sim2real.emulation.truth import Kind
 from sim2real.errors import HardwareLost
 from sim2real.hardware import dynamixel as reg
-from sim2real.hardware.bus.port import BusConfig
-from sim2real.hardware.bus.servos import VoltageDrive
 from sim2real.hardware.device import OperatingMode
-from sim2real.hardware.dynamixel import DynamixelServos
-from sim2real.hardware.safety.gate import GateConfig
-from sim2real.hardware.safety.rig import Rig
-
-SUPPLY_V = 5.0
-TIMEOUT_S = 0.1
 
 
 @pytest.fixture
-def open_rig(start_robot):
-    """Open a rig on a servo whose speed follows its voltage: 6 rad/s at 5 V."""
+def open_rig():
+    """Open a rig on servos whose speed follows their voltage: 6 rad/s at 5 V."""
     rigs = []
 
-    def open_(config=None, silence_s=0.4, **gate):
-        robot = start_robot("FirstOrder", config)
-        bus = BusConfig(robot.port, silence_s=silence_s)
-        limits = GateConfig(**{"limit": 4.0, "command_timeout_s": TIMEOUT_S, **gate})
-        rigs.append(Rig(DynamixelServos(bus, [1], VoltageDrive(SUPPLY_V)), limits))
+    def open_(**gate):
+        robot = VOLTS.robot()
+        rigs.append(VOLTS.rig(robot, {"command_timeout_s": 0.1, **gate}, silence_s=0.4))
         return rigs[-1], robot
 
     yield open_
@@ -35,7 +26,7 @@ def open_rig(start_robot):
 
 
 def volts(rig, value):
-    return rig.command(np.array([value]), 0.0, 1e-9 * rig.clock.now_ns())
+    return rig.command(np.full(3, value), 0.0, 1e-9 * rig.clock.now_ns())
 
 
 def run(rig, value, duration_s, period_s=0.02):
@@ -56,8 +47,8 @@ def effects(robot):
 def test_commands_are_volts_and_come_back_as_sent(open_rig):
     rig, _ = open_rig()
     rig.start()
-    assert volts(rig, 2.5) == 2.5
-    assert volts(rig, 9.0) == 4.0
+    assert volts(rig, 2.5).tolist() == [2.5] * 3
+    assert volts(rig, 9.0).tolist() == [4.0] * 3
     run(rig, 2.5, 0.4)
     reading = rig.measure()
     assert (reading.velocity_rad_s[0], reading.load[0]) == (pytest.approx(3.0, rel=0.1), pytest.approx(0.5, abs=0.002))
@@ -113,7 +104,7 @@ def test_a_soft_stop_fades_the_voltage_before_the_torque_goes_off(open_rig):
     assert sent[-1] == 0.0
     rig.stop()
     rig.start()  # the next episode is a full one again
-    assert volts(rig, 3.0) == 3.0
+    assert volts(rig, 3.0)[0] == 3.0
     assert not rig.eased
     rig.stop()
     assert effects(robot)[1][-1] == OperatingMode.OFF

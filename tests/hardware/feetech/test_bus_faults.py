@@ -3,8 +3,6 @@
 import pytest
 from families import STS, VOLTS
 
-from sim2real.emulation.dynamixel import EmulatorConfig
-from sim2real.emulation.feetech import StsEmulation
 from sim2real.errors import HardwareLost, SafetyStop
 from sim2real.hardware import dynamixel as reg
 from sim2real.hardware import feetech as sts
@@ -29,31 +27,26 @@ def at_once(answer):
     return answer[:4] + bytes(byte & (37 * i + 11) for i, byte in enumerate(answer[4:]))
 
 
-def test_two_answers_to_one_ping_are_refused(serve, connect):
-    robot = serve()
-    answer_twice(robot, 2, 2, one_after_the_other)
-    with pytest.raises(HardwareLost, match=r"have the id 2 \(joint 'joint2'\): both answer[\s\S]*hint: connect one"):
-        connect(robot)
+@pytest.mark.parametrize(
+    ("family", "place", "join", "said"),
+    [
+        (STS, 2, one_after_the_other, r"have the id 2 \(joint 'joint2'\): both answer[\s\S]*hint: connect one"),
+        (STS, 2, at_once, r"servo 2 .* does not answer[\s\S]*two servos of one id garble"),
+        (VOLTS, 4, one_after_the_other, r"two servos on .* have the id 2.*both answer, and both would obey"),
+    ],
+)
+def test_two_answers_to_one_ping_are_refused(family, place, join, said):
+    robot = family.robot()
+    answer_twice(robot, 2, place, join)
+    with pytest.raises(HardwareLost, match=said):
+        family.device(robot, max_silence_s=0.1).open()
 
 
-def test_answers_that_garble_each_other_are_explained(serve, connect):
-    robot = serve()
-    answer_twice(robot, 2, 2, at_once)
-    with pytest.raises(HardwareLost, match=r"servo 2 .* does not answer[\s\S]*two servos of one id garble"):
-        connect(robot, max_silence_s=0.1)
-
-
-def test_a_late_answer_is_no_second_servo(serve, connect):
+def test_a_late_answer_is_no_second_servo():
     for seed in range(3):
-        connect(serve(config=StsEmulation(return_delay_us=0, seed=seed, late=0.3, late_s=0.012))).close()
-
-
-def test_dynamixels_too(serve, open_servos):
-    robot = serve("FirstOrder", EmulatorConfig(), ids=(1, 2))
-    answer_twice(robot, 1, 4, one_after_the_other)
-    open_servos(robot, (2,)).close()
-    with pytest.raises(HardwareLost, match=r"two servos on .* have the id 1.*both answer, and both would obey"):
-        open_servos(robot)
+        robot = STS.robot(settings={"return_delay_us": 0, "seed": seed, "late": 0.3, "late_s": 0.012})
+        with STS.device(robot, silence_s=1.0):
+            pass
 
 
 ALARMS = {
@@ -77,10 +70,12 @@ def test_an_alarm_in_motion_is_named_and_torque_ends_off(family, bit):
     assert family.on(robot) == []
 
 
-def test_a_host_that_dies_while_its_cable_is_out_leaves_the_torque_on(serve, connect):
+def test_a_host_that_dies_while_its_cable_is_out_leaves_the_torque_on():
     """The guardian reaches no servo either, and says so."""
-    robot = serve()
-    connect(robot, silence_s=0.1).enable()
+    robot = STS.robot()
+    device = STS.device(robot, silence_s=0.1)
+    device.open()
+    device.enable()
     robot.strike(silent_after_s=0.0)
     robot.kill_host()
     assert STS.on(robot) == [1, 2, 3]
