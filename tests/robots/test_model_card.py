@@ -148,16 +148,9 @@ def two_links(folder, own, commands):
 
 
 @pytest.mark.night
-@pytest.mark.parametrize(
-    ("own", "commands"),
-    [
-        (PLAIN, ("goal",)),
-        pytest.param(PLAIN | TERMS, ("goal", "kp", "enabled", "torque", "goal_velocity"), marks=pytest.mark.night),
-    ],
-    ids=["plain", "every term"],
-)
-def test_a_robot_that_only_its_file_describes(own, commands, tmp_path):
-    robot, episode = two_links(tmp_path, own, commands)
+def test_a_robot_that_only_its_file_describes(tmp_path):
+    own = PLAIN | TERMS
+    robot, episode = two_links(tmp_path, own, ("goal", "kp", "enabled", "torque", "goal_velocity"))
     found = known(robot, episode, {**own, "delay": 0.0131}, (2.0, 3.0, 4.0))
     check(card_of(robot, found, tmp_path / "card"))
 
