@@ -107,50 +107,6 @@ def energy(plant, states):
     return plant._J * (states[:, 1] ** 2 / 2 + groups["gravity"] * np.cos(states[:, 0]))
 
 
-@pytest.mark.parametrize(("th", "thdot", "voltage"), [(2.0, 5.0, 1.0), (0.5, -7.0, -2.0), (np.pi, 3.0, 2.0)])
-def test_the_plant_accelerates_as_its_truth_says(th, thdot, voltage):
-    plant = released(PLANT.PendulumPlant(), th, thdot)
-    plant.command(1, PWM, voltage / PLANT.SUPPLY_V)
-    states = trajectory(plant, 0.01)
-    measured = (states[-1, 1] - states[0, 1]) / 0.0095
-    middle = states.mean(axis=0)
-    expected = acceleration(plant.truth(), middle[0], middle[1], voltage, np.sign(thdot))
-    assert measured == pytest.approx(expected, rel=0.01, abs=0.2)
-
-
-def test_energy_stays_without_friction_and_motor():
-    plant = released(PLANT.PendulumPlant(friction=0.0), 1.0)
-    plant.command(1, OFF, 0.0)
-    states = trajectory(plant, 3.0)
-    total = energy(plant, states)
-    assert np.ptp(states[:, 0]) > 3.0
-    assert np.ptp(total) < 0.01 * np.ptp(plant._J * states[:, 1] ** 2 / 2)
-
-
-def test_energy_goes_into_friction():
-    plant = released(PLANT.PendulumPlant(), 1.0)
-    plant.command(1, OFF, 0.0)
-    states = trajectory(plant, 1.0)
-    total, speed = energy(plant, states), np.abs(states[:, 1])
-    lost = (plant._c * speed + plant._b * speed**2).sum() * 0.0005
-    assert total[0] - total[-1] == pytest.approx(lost, rel=0.02)
-
-
-def test_dry_friction_holds_it_within_a_band_and_not_beyond():
-    groups = PLANT.PendulumPlant().truth()
-    band = np.arcsin(groups["friction"] / groups["gravity"])
-    for share, moves in ((0.8, False), (1.25, True)):
-        plant = released(PLANT.PendulumPlant(), np.pi - share * band)
-        plant.command(1, OFF, 0.0)
-        states = trajectory(plant, 1.0)
-        assert (abs(states[-1, 0] - states[0, 0]) > 0.005) == moves
-    plant = released(PLANT.PendulumPlant(), np.pi - 1.5)
-    plant.command(1, OFF, 0.0)
-    states = trajectory(plant, 5.0)
-    assert abs(states[-1, 0] - np.pi) < 1.05 * band
-    assert abs(states[-1, 1]) < 0.01
-
-
 def test_the_motor_brakes_only_while_torque_is_on():
     """At 0 V the winding is shorted and the back-EMF brakes; with torque off it is open."""
     slow, fast = released(PLANT.PendulumPlant(friction=0.0), np.pi, 5.0), released(PLANT.PendulumPlant(0.0), np.pi, 5.0)
