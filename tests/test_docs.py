@@ -45,7 +45,6 @@ MARKS = {
     "docs/guides/identify.md": [NIGHT],
     "docs/guides/interop.md": [NIGHT],
     "docs/guides/notebook.md": [NIGHT],
-    "docs/reference/identification.md": [NIGHT],
     "docs/reference/runs.md": [NIGHT],
     "docs/tutorial.md": [NIGHT],
     "sim2real.identification": [NIGHT],
