@@ -192,9 +192,6 @@ class Agent(PolicyAgent):
     def row(self, reading: Measurement, features: Array, command: Array, action: Array) -> Array:
         return namespace(features, action).concatenate([features, action])
 
-    def message(self, command: Array, step_state: StepState) -> Command:
-        return Command(command)
-
 
 def features(m: Measurement) -> Array:
     """Return the policy's features of a measurement, ``(3,)``; in numpy on the robot, which runs without JAX."""

@@ -52,7 +52,7 @@ class HingeDrive(RobotDrive):
     channels = (Channel("th", "thdot", position_sigma=0.002, velocity_sigma=0.05, label=HINGE),)
     at_rest = Measurement(th=np.float64(np.pi), thdot=np.float64(0.0))
     command, message = "action", Command
-    units = {"th": "rad", "thdot": "rad/s", "action": "V", "voltage": "V", "command": "V"}
+    units = {"th": "rad", "thdot": "rad/s", "action": "V", "voltage": "V"}
     probe = Probe(step=1.5, lag_s=(0.0, 0.0015))
 
     def __init__(self, mounting: tuple[Joint, ...] = ()) -> None:

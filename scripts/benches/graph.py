@@ -123,7 +123,7 @@ def nodes(agent_hz: float = 50.0, world_hz: float = 50.0, substep_s: float = 0.0
     world = CostWorld("world", world_hz, substep_s=substep_s)
     sensor = SimSensor("sensor", agent_hz, world, delay_dist=dist(0.0075, 0.003))
     agent = RandomAgent("agent", agent_hz, delay_dist=dist(0.01, 0.003))
-    actuator = SimActuator("actuator", agent_hz, 1, "action", MODEL.Command, delay_dist=dist(0.0075, 0.003))
+    actuator = SimActuator("actuator", agent_hz, 1, MODEL.Command, delay_dist=dist(0.0075, 0.003))
     agent.connect(sensor, blocking=True, window=3, delay_dist=dist(0.002, 0.002))
     actuator.connect(agent, blocking=True, delay_dist=dist(0.002, 0.002))
     world.connect(actuator, skip=True, delay_dist=dist(0.01, 0.002))

@@ -33,8 +33,8 @@ class AgentParams(Base):
     """
 
     policy: PyTree = None
-    aim: Array | None = None
-    start: Array | None = None
+    aim: PyTree = None
+    start: PyTree = None
 
     @classmethod
     def of(cls, start: EpisodeStart, policy: PyTree = None) -> AgentParams:
@@ -70,13 +70,24 @@ class PolicyAgent(BaseNode):
     Args:
         actions: Number of actions, which is that of the commands.
         columns: Widths of the parts of a row of the history.
+        aims: Number of an episode's numbers that the aim depends on: its entries, if it does not move.
+        at: The aim for these numbers and a time [s]; None: they are the aim.
     """
 
     def __init__(
-        self, name: str, rate: float, actions: int, history: int, columns: Sequence[int], **options: Unpack[NodeOptions]
+        self,
+        name: str,
+        rate: float,
+        actions: int,
+        history: int,
+        columns: Sequence[int],
+        aims: int = 0,
+        at: Callable[[Array, Scalar], Array] | None = None,
+        **options: Unpack[NodeOptions],
     ) -> None:
         super().__init__(name, rate, **options)
         self._actions, self._history, self._ends = actions, history, np.cumsum([0, *columns]).tolist()
+        self._aims, self._at = aims, at
 
     @abstractmethod
     def features(self, reading: PyTree, step_state: StepState) -> Array:
@@ -90,28 +101,28 @@ class PolicyAgent(BaseNode):
         """Return what is remembered of a step, ``(row,)``; default: the features."""
         return features
 
-    @abstractmethod
-    def message(self, command: Array, step_state: StepState) -> PyTree:
-        """Return the message of a command."""
-
     def shown(self, features: Array, step_state: StepState) -> Array:
         """Return the part of the observation before the history; default: the features."""
         return features
 
+    def aim(self, step_state: StepState) -> Array:
+        """Return the aim ``(k,)`` at a step; its time is that of the schedule, on the robot as in simulation."""
+        aim = step_state.params.aim
+        return aim if self._at is None else self._at(aim, step_state.seq / self.rate)
+
     def init_params(self, rng: Key | None = None, graph_state: GraphState | None = None) -> AgentParams:
-        return AgentParams(start=np.zeros(self._actions, np.float32))
+        return AgentParams(aim=np.zeros(self._aims, np.float32), start=np.zeros(self._actions, np.float32))
 
     def init_state(self, rng: Key | None = None, graph_state: GraphState | None = None) -> AgentState:
         params = self._params(graph_state)
-        start = np.zeros(self._actions) if params.start is None else params.start
         past, still = np.zeros((self._history, self._ends[-1]), np.float32), np.zeros(self._actions, np.float32)
         carry = params.policy.initial_carry() if hasattr(params.policy, "initial_carry") else ()
-        return AgentState(namespace(start).asarray(start, np.float32), still, still, past, carry)
+        return AgentState(namespace(params.start).asarray(params.start, np.float32), still, still, past, carry)
 
-    def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> PyTree:
+    def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> Decision:
         params = self._params(graph_state)
-        start = np.zeros(self._actions) if params.start is None else params.start
-        return self.message(namespace(start).asarray(start, np.float32), StepState(params=params, seq=0))
+        start = namespace(params.start).asarray(params.start, np.float32)
+        return self._decision(start, StepState(params=params, seq=0))
 
     def observe(self, step_state: StepState) -> Array:
         """Return the policy's observation."""
@@ -121,7 +132,7 @@ class PolicyAgent(BaseNode):
         parts = [past[:, a:b].ravel() for a, b in zip(self._ends, self._ends[1:], strict=False)]
         return xp.concatenate([shown, *parts]).astype(np.float32)
 
-    def act(self, step_state: StepState, action: Array) -> tuple[StepState, PyTree]:
+    def act(self, step_state: StepState, action: Array) -> tuple[StepState, Decision]:
         """Return the new step state and the message for an action ``(actions,)``."""
         state, now = step_state.state, self._now(step_state)
         xp = namespace(action, now, state.command)
@@ -130,9 +141,9 @@ class PolicyAgent(BaseNode):
         row = self.row(step_state.inputs[SENSOR][-1].data, now, command, action).astype(np.float32)
         past = xp.concatenate([row[None], state.past])[: self._history]
         new = state.replace(command=command, last=action, before=state.last, past=past)
-        return step_state.replace(state=new), self.message(command, step_state)
+        return step_state.replace(state=new), self._decision(command, step_state)
 
-    def step(self, step_state: StepState) -> tuple[StepState, PyTree]:
+    def step(self, step_state: StepState) -> tuple[StepState, Decision]:
         policy, state = step_state.params.policy, step_state.state
         if policy is None:
             return self.act(step_state, np.zeros(self._actions, np.float32))
@@ -140,6 +151,12 @@ class PolicyAgent(BaseNode):
             return self.act(step_state, policy.get_action(self.observe(step_state)))
         carry, action = policy.step(state.carry, self.observe(step_state))
         return self.act(step_state.replace(state=state.replace(carry=carry)), action)
+
+    def _decision(self, command: Array, step_state: StepState) -> Decision:
+        if not self._aims:
+            return Decision(command)
+        aim = self.aim(step_state)
+        return Decision(command, namespace(aim).asarray(aim, np.float32))
 
     def _now(self, step_state: StepState) -> Array:
         return self.features(step_state.inputs[SENSOR][-1].data, step_state)
@@ -157,8 +174,6 @@ class GoalAgent(PolicyAgent):
         low: Shape ``(joints,)``: lowest goals [rad].
         high: Shape ``(joints,)``: highest goals [rad].
         features: Features of now: (reading, goals, aim) -> ``(features,)``.
-        aims: Number of an episode's numbers that the aim depends on: its entries, if it does not move.
-        at: The aim for these numbers and a time [s]; None: they are the aim.
     """
 
     def __init__(
@@ -173,27 +188,15 @@ class GoalAgent(PolicyAgent):
         at: Callable[[Array, Scalar], Array] | None = None,
         **options: Unpack[NodeOptions],
     ) -> None:
-        super().__init__(name, rate, len(low), history, (3 * len(low),), **options)
+        super().__init__(name, rate, len(low), history, (3 * len(low),), aims, at, **options)
         self._low, self._high = np.asarray(low, np.float32), np.asarray(high, np.float32)
-        self._features, self._aims, self._at = features, aims, at
-
-    def init_params(self, rng: Key | None = None, graph_state: GraphState | None = None) -> AgentParams:
-        return AgentParams(aim=np.zeros(self._aims, np.float32), start=np.zeros_like(self._low))
+        self._features = features
 
     def features(self, reading: JointReading, step_state: StepState) -> Array:
-        return self._features(reading, step_state.state.command, self._aim(step_state))
+        return self._features(reading, step_state.state.command, self.aim(step_state))
 
     def command(self, before: Array, action: Array) -> Array:
         return namespace(before, action).clip(before + action / self.rate, self._low, self._high)
 
     def row(self, reading: JointReading, features: Array, command: Array, action: Array) -> Array:
         return namespace(command, reading.position).concatenate([reading.position, reading.velocity, command])
-
-    def message(self, command: Array, step_state: StepState) -> Decision:
-        aim = self._aim(step_state)
-        return Decision(command, namespace(aim).asarray(aim, np.float32))
-
-    def _aim(self, step_state: StepState) -> Array:
-        """Return the aim at a step; its time is that of the policy's schedule, on the robot as in simulation."""
-        aim = step_state.params.aim
-        return aim if self._at is None else self._at(aim, step_state.seq / self.rate)

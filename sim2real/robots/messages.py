@@ -1,4 +1,4 @@
-"""The messages between the nodes of a servo robot."""
+"""The messages between the nodes of a robot."""
 
 from sim2real import pytree
 from sim2real.graph.base import Base
@@ -31,15 +31,15 @@ class Goals(Base):
 
 @pytree.dataclass
 class Decision(Base):
-    """The agent's message: a command, and the aim of the task.
+    """The agent's message: what the motors shall do, and the aim of the task.
 
     Attributes:
-        goal: Shape ``(joints,)``: goal positions [rad].
-        aim: Shape ``(k,)``: the task's aim in this episode, e.g. a target's position ``(3,)`` [m].
+        command: Shape ``(actions,)``: the command, such as goal positions [rad].
+        aim: Shape ``(k,)``: the task's aim at this time, e.g. a target's position ``(3,)`` [m]; None: it has none.
     """
 
-    goal: Array
-    aim: Array
+    command: Array
+    aim: Array | None = None
 
 
 @pytree.dataclass

@@ -22,7 +22,7 @@ from sim2real.later import jax, jnp
 from sim2real.policy.runner import Runner
 from sim2real.robots.agent import AgentParams, PolicyAgent
 from sim2real.robots.loop import ACTUATOR, AGENT, SENSOR, DelayParams, control_nodes, delay_of
-from sim2real.robots.messages import Goals
+from sim2real.robots.messages import Decision, Goals
 from sim2real.types import Array, Key, PyTree
 
 if TYPE_CHECKING:
@@ -129,8 +129,7 @@ class SimActuator(BaseNode):
     The default output is ``start`` of the agent's parameters, at which the joints are held, or zeros if they have none.
 
     Args:
-        field: Field of the agent's message that is the command, shape ``(joints,)``.
-        message: Makes the node's message from this command.
+        message: Makes the node's message from a command ``(joints,)``.
     """
 
     def __init__(
@@ -138,12 +137,11 @@ class SimActuator(BaseNode):
         name: str,
         rate: float,
         joints: int,
-        field: str = "goal",
         message: Callable[[PyTree], PyTree] = Goals,
         **options: Unpack[NodeOptions],
     ) -> None:
         super().__init__(name, rate, **options)
-        self._joints, self._field, self._message = joints, field, message
+        self._joints, self._message = joints, message
 
     def init_params(self, rng: Key | None = None, graph_state: GraphState | None = None) -> DelayParams:
         return DelayParams()
@@ -153,7 +151,7 @@ class SimActuator(BaseNode):
         return self._message(np.zeros(self._joints, np.float32) if start is None else jnp.asarray(start, jnp.float32))
 
     def step(self, step_state: StepState) -> tuple[StepState, PyTree]:
-        return step_state, self._message(getattr(step_state.inputs[AGENT][-1].data, self._field))
+        return step_state, self._message(step_state.inputs[AGENT][-1].data.command)
 
 
 # -- on hardware
@@ -194,9 +192,8 @@ class ServoActuator(BaseNode):
     """Sends the agent's commands through the safety gate; its output is the command that was sent.
 
     Args:
-        field: Field of the agent's message that is the command, shape ``(motors,)``.
-        message: Makes the node's message from this command. If the device's commands have columns, it has a field of
-            the shape ``(motors,)`` for each, by the column's name.
+        message: Makes the node's message from a command ``(motors,)``. If the device's commands have columns, it has a
+            field of the shape ``(motors,)`` for each, by the column's name.
         begin: Called after the torque is on: brings the robot to the start of the task.
     """
 
@@ -207,13 +204,12 @@ class ServoActuator(BaseNode):
         name: str,
         rate: float,
         rig: Rig,
-        field: str,
         message: Callable[[np.ndarray], Any],
         begin: Callable[[], None] | None = None,
         **options: Unpack[NodeOptions],
     ) -> None:
         super().__init__(name, rate, **options)
-        self._rig, self._field, self._message, self._begin = rig, field, message, begin
+        self._rig, self._message, self._begin = rig, message, begin
 
     def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> PyTree:
         return self._message(np.zeros(len(self._rig.device.motors)))
@@ -239,7 +235,7 @@ class ServoActuator(BaseNode):
         message = step_state.inputs[AGENT]
         now_s = self.now()
         age_s = now_s - float(message.ts_sent[-1]) if int(message.seq[-1]) >= 0 else 0.0
-        wanted = np.asarray(getattr(message.data, self._field)[-1], np.float64)
+        wanted = np.asarray(message.data.command[-1], np.float64)
         names = [column.name for column in self._rig.device.commanded.columns]
         if not names:
             return step_state, self._message(self._rig.command(wanted, age_s, now_s))
@@ -262,25 +258,17 @@ class Excitation(BaseNode):
 
     jittable = False
 
-    def __init__(
-        self,
-        name: str,
-        rate: float,
-        signal: np.ndarray,
-        message: Callable[[np.ndarray], Any],
-        **options: Unpack[NodeOptions],
-    ) -> None:
+    def __init__(self, name: str, rate: float, signal: np.ndarray, **options: Unpack[NodeOptions]) -> None:
         super().__init__(name, rate, **options)
         if not np.isfinite(signal).all():
             raise UsageError("the excitation has values that are not finite")
-        self._signal, self._message = signal, message
+        self._signal = signal
 
-    def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> PyTree:
-        return self._message(np.zeros(self._signal.shape[1]))
+    def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> Decision:
+        return Decision(np.zeros(self._signal.shape[1]))
 
-    def step(self, step_state: StepState) -> tuple[StepState, PyTree]:
-        row = min(int(step_state.seq), len(self._signal) - 1)
-        return step_state, self._message(self._signal[row])
+    def step(self, step_state: StepState) -> tuple[StepState, Decision]:
+        return step_state, Decision(self._signal[min(int(step_state.seq), len(self._signal) - 1)])
 
 
 class PolicyNode(BaseNode):
@@ -384,7 +372,7 @@ def recording_nodes(robot: Robot, rig: Rig, signal: np.ndarray | None, standing:
     rows = np.asarray(signal, np.float64).reshape(-1, len(robot.task.action)) + drive.centre
     if not standing and robot.units.get(drive.command) == "rad":
         rows = approached(rows, rig.wait_until_still(_HANG_S, _STILL_RAD_S).position_rad, drive.rate_hz)
-    player = Excitation(AGENT, drive.rate_hz, rows, drive.message, delay=drive.expected_delay_s[1])
+    player = Excitation(AGENT, drive.rate_hz, rows, delay=drive.expected_delay_s[1])
     return _on_hardware(robot, rig, player, (lambda: drive.begin(rig)) if standing else None)
 
 
@@ -414,7 +402,7 @@ def approached(goals: np.ndarray, position_rad: np.ndarray, rate_hz: float) -> n
 
 def _on_hardware(robot: Robot, rig: Rig, agent: BaseNode, begin: Callable[[], None] | None) -> dict[str, BaseNode]:
     drive, options = robot.drive, {"begin": begin, "delay": robot.drive.expected_delay_s[2]}
-    actuator = ServoActuator(ACTUATOR, drive.rate_hz, rig, drive.command, drive.message, **options)
+    actuator = ServoActuator(ACTUATOR, drive.rate_hz, rig, drive.message, **options)
     return control_nodes(_sensor(robot, rig), agent, actuator)
 
 

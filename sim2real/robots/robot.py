@@ -84,7 +84,7 @@ class RobotDrive(ABC):
         channels: The measured quantities of each joint, in the order of the motors.
         at_rest: The sensor's message of a robot at rest.
         noise: Noise of the readings in training without an identification.
-        command: Field of the actuator's message that is sent to the motors, one entry for each action.
+        command: Field of the actuator's message that has the command, one entry for each action.
         message: Makes the actuator's message from a command ``(actions,)``.
         units: Field of either message -> its unit.
         expected_delay_s: Computation delays of sensor, agent and actuator that phases allow for: a bus transaction, and
@@ -321,7 +321,7 @@ class Robot(RecordedRobot):
 
     @property
     def units(self) -> Mapping[str, str]:
-        return {**self.drive.units, **self.task.units}
+        return {**self.drive.units, "command": self.drive.units[self.drive.command], **self.task.units}
 
     def nominal(self) -> dict[str, float]:
         """Return the nominal values of the model's parameters, without delays."""
@@ -450,6 +450,5 @@ def as_columns(fields: Mapping[str, PyTree]) -> dict[str, np.ndarray]:
 
 
 def as_sent(robot: Robot, decided: Mapping[str, Any], commanded: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return the columns of the agent's message without its command, and of the command to the motors."""
-    field = robot.drive.command
-    return as_columns({**{n: v for n, v in decided.items() if n != field}, "command": commanded[field]})
+    """Return the columns of the agent's message, with the command as it was sent to the motors."""
+    return as_columns({**decided, "command": commanded[robot.drive.command]})

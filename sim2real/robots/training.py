@@ -59,7 +59,7 @@ def node_parameters(
 
 def _sim_actuator(robot: Robot, **options: Unpack[NodeOptions]) -> SimActuator:
     drive = robot.drive
-    return SimActuator(ACTUATOR, drive.rate_hz, len(robot.task.action), drive.command, drive.message, **options)
+    return SimActuator(ACTUATOR, drive.rate_hz, len(robot.task.action), drive.message, **options)
 
 
 def _lead_s(world: BaseNode) -> float:

@@ -106,7 +106,6 @@ from sim2real.hardware.unitree.legs import LegDrive
 from sim2real.log.writer import McapRecorder
 from sim2real.robots.nodes import Excitation, ServoActuator, ServoSensor
 from sim2real.robots.loop import ACTUATOR, AGENT, SENSOR, control_nodes
-from sim2real.robots.messages import Goals
 from sim2real.robots.walking.drive import WalkingDrive, leg_command
 from sim2real.runtime.asynchronous import AsyncGraph
 from pipelines.go2.plant import LYING
@@ -122,8 +121,8 @@ goals = LYING + stood * (np.array([0.0, 0.8, -1.5] * 4) - LYING)
 
 with Rig(device, gate) as rig:
     sensor = ServoSensor(SENSOR, 50.0, rig, body.read, body.at_rest, delay=0.002)
-    player = Excitation(AGENT, 50.0, goals, Goals, delay=0.002)
-    actuator = ServoActuator(ACTUATOR, 50.0, rig, "goal", lambda q: leg_command(q, 60.0, 4.0), delay=0.002)
+    player = Excitation(AGENT, 50.0, goals, delay=0.002)
+    actuator = ServoActuator(ACTUATOR, 50.0, rig, lambda q: leg_command(q, 60.0, 4.0), delay=0.002)
     graph = AsyncGraph(control_nodes(sensor, player, actuator), player)
     state = graph.init(jax.random.key(0), {{}})
     graph.warmup(state)

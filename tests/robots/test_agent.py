@@ -66,7 +66,7 @@ def seeing(step_state, position, velocity):
 def test_an_action_is_the_speed_of_the_goals_and_they_stay_within_their_limits():
     agent = make_agent()
     step_state, first = started(agent)
-    np.testing.assert_allclose(first.goal, START, rtol=1e-6)
+    np.testing.assert_allclose(first.command, START, rtol=1e-6)
     actions = np.random.default_rng(1).uniform(-2, 2, (150, 2)) + np.array([1.0, -1.0])
     expected = START
     clipped = False
@@ -74,8 +74,8 @@ def test_an_action_is_the_speed_of_the_goals_and_they_stay_within_their_limits()
         step_state, decision = agent.act(seeing(step_state, np.zeros(2), np.zeros(2)), action)
         clipped |= bool(np.any(np.abs(expected + action / RATE_HZ - 0.1) > 1.0))
         expected = np.clip(expected + action / RATE_HZ, LOW, HIGH)
-        np.testing.assert_allclose(decision.goal, expected, atol=1e-5)
-        np.testing.assert_array_equal(step_state.state.command, decision.goal)
+        np.testing.assert_allclose(decision.command, expected, atol=1e-5)
+        np.testing.assert_array_equal(step_state.state.command, decision.command)
     assert expected[0] > 0.7, "it was pushed to a limit"
     assert expected[1] < -0.4
 
@@ -84,7 +84,7 @@ def test_a_start_beyond_the_limits_is_brought_back():
     agent = make_agent()
     step_state, _ = started(agent, start=jnp.array([0.9, -0.6]))
     _, decision = agent.act(seeing(step_state, np.zeros(2), np.zeros(2)), np.zeros(2))
-    np.testing.assert_allclose(decision.goal, [0.8, -0.5], rtol=1e-6)
+    np.testing.assert_allclose(decision.command, [0.8, -0.5], rtol=1e-6)
 
 
 def test_history_is_what_was_seen_and_told_newest_first():
@@ -99,7 +99,7 @@ def test_history_is_what_was_seen_and_told_newest_first():
         np.testing.assert_allclose(shown, np.concatenate([features, *rows]), atol=1e-6)
         assert shown.dtype == np.float32
         step_state, decision = agent.act(step_state, np.array([0.5, -0.5]))
-        rows = [np.concatenate([position, velocity, np.asarray(decision.goal)]), *rows[:2]]
+        rows = [np.concatenate([position, velocity, np.asarray(decision.command)]), *rows[:2]]
 
 
 def test_it_asks_the_policy_and_without_one_goals_stay():
@@ -107,10 +107,10 @@ def test_it_asks_the_policy_and_without_one_goals_stay():
     step_state, _ = started(agent, policy=policy)
     now = seeing(step_state, np.array([0.3, 0.1]), np.zeros(2))
     _, decision = agent.step(now)
-    np.testing.assert_allclose(decision.goal, START + np.array([1.0, -2.0]) / RATE_HZ, atol=1e-6)
+    np.testing.assert_allclose(decision.command, START + np.array([1.0, -2.0]) / RATE_HZ, atol=1e-6)
     np.testing.assert_array_equal(policy.shown[0], agent.observe(now))
     _, decision = agent.step(now.replace(params=now.params.replace(policy=None)))
-    np.testing.assert_allclose(decision.goal, START, atol=1e-7)
+    np.testing.assert_allclose(decision.command, START, atol=1e-7)
 
 
 def test_the_pendulums_agent_sends_actions_as_they_are_and_shows_what_it_saw_and_did_before():
@@ -123,7 +123,7 @@ def test_the_pendulums_agent_sends_actions_as_they_are_and_shows_what_it_saw_and
         policy.action = jnp.array([0.5 + k])
         made = agent.step(StepState(state=state, params=AgentParams(policy=policy), inputs=heard))
         state = made[0].state
-        sent.append(float(made[1].action[0]))
+        sent.append(float(made[1].command[0]))
     assert sent == [0.5, 1.5, 2.5]
     rows = np.zeros((3, model.HISTORY, 4))
     rows[1, 0], rows[2, :2] = [1, 0, 0, 0.5], [[1, 0, 1, 1.5], [1, 0, 0, 0.5]]

@@ -13,7 +13,6 @@ from sim2real.hardware.bus.servos import ServoJoint
 from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.safety.gate import GateLimits
 from sim2real.log.reader import read_log
-from sim2real.robots.messages import Goals
 from sim2real.robots.nodes import Excitation, connected, deployment_nodes, recording_nodes
 from sim2real.robots.training import simulation_params
 from sim2real.stages.load import load_robot, moving
@@ -95,7 +94,7 @@ def test_the_gate_lets_through_what_both_the_robot_and_the_stage_allow(episodes)
 
 
 def test_the_agents_place_plays_the_signal_and_then_holds_its_end(episodes):
-    played = episodes.recorded.outputs["agent"]["goal"]
+    played = episodes.recorded.outputs["agent"]["command"]
     expected = np.concatenate([SIGNAL, np.tile(SIGNAL[-1], (len(played), 1))])[: len(played)]
     assert len(played) > len(SIGNAL)
     np.testing.assert_allclose(played, expected)
@@ -148,7 +147,7 @@ def test_the_time_on_the_bus_is_part_of_every_step_that_uses_it(episodes):
 
 
 def test_a_policy_moves_goals_from_where_the_robot_is(episodes):
-    start, goals = np.asarray(episodes.params["agent"].start), episodes.deployed.outputs["agent"]["goal"]
+    start, goals = np.asarray(episodes.params["agent"].start), episodes.deployed.outputs["agent"]["command"]
     count = np.arange(1, len(goals) + 1)[:, None]
     expected = start + count / 50.0 * np.array([1.0, -0.5, 0.25])
     np.testing.assert_allclose(goals, np.clip(expected, *episodes.range), atol=1e-4)
@@ -214,7 +213,7 @@ def test_no_command_leaps_where_a_recording_outlasts_its_excitation(name):
     rig = SimpleNamespace(measure=lambda: rest, wait_until_still=lambda *_: rest)
     signal = 0.5 + 0.1 * np.linspace(0.0, 1.0, 100)[:, None] * np.ones(len(robot.task.action))
     agent = recording_nodes(robot, rig, signal, standing=name == "go2")["agent"]
-    played = np.array([getattr(agent.step(SimpleNamespace(seq=k))[1], robot.drive.command) for k in range(200)])
+    played = np.array([agent.step(SimpleNamespace(seq=k))[1].command for k in range(200)])
     assert np.abs(np.diff(played[98:], axis=0)).max() < 0.03
     np.testing.assert_array_equal(played[-50:], np.tile(played[-1], (50, 1)))
 
@@ -223,4 +222,4 @@ def test_an_excitation_of_no_numbers_is_refused():
     signal = np.zeros((4, 3))
     signal[2, 1] = np.nan
     with pytest.raises(UsageError, match="not finite"):
-        Excitation("agent", 50.0, signal, Goals)
+        Excitation("agent", 50.0, signal)

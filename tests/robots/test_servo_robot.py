@@ -90,7 +90,7 @@ def test_a_recording_begins_where_the_joints_are(pair):
     rig = SimpleNamespace(wait_until_still=lambda *_: reading)
     signal = 0.2 * np.sin(np.arange(100))[:, None] * np.ones(2)
     agent = recording_nodes(pair, rig, signal)["agent"]
-    played = np.array([agent.step(SimpleNamespace(seq=k))[1].goal for k in range(100)])
+    played = np.array([agent.step(SimpleNamespace(seq=k))[1].command for k in range(100)])
     np.testing.assert_allclose(played[0], reading.position_rad)
     off = np.abs(played - signal)
     assert np.abs(np.diff(off, axis=0)).max() <= 1.0 / pair.drive.rate_hz + 1e-9
@@ -104,7 +104,7 @@ def test_an_excitation_is_around_the_middle_and_waits_where_it_ends():
     rig = SimpleNamespace(wait_until_still=lambda *_: reading)
     signal = 0.1 * np.sin(np.arange(40))[:, None] * np.ones(2)
     agent = recording_nodes(robot, rig, signal)["agent"]
-    played = np.array([agent.step(SimpleNamespace(seq=k))[1].goal for k in range(60)])
+    played = np.array([agent.step(SimpleNamespace(seq=k))[1].command for k in range(60)])
     np.testing.assert_allclose(played[:40], signal + np.array([0.3, -0.2]))
     np.testing.assert_allclose(played[40:], np.tile(played[39], (20, 1)))
     np.testing.assert_allclose(robot.drive.centre, [0.3, -0.2])

@@ -28,7 +28,7 @@ def states(tmp_path_factory):
     rows = np.arange(50.0)[:, None] + np.array([0.0, 0.1, 0.2])
     outputs = {
         "sensor": {"position": 0.01 * rows, "velocity": rows},
-        "agent": {"goal": 2 * rows[:49], "aim": 0 * rows[:49] + [0.1, 0.2, 0.3]},
+        "agent": {"command": 2 * rows[:49], "aim": 0 * rows[:49] + [0.1, 0.2, 0.3]},
         "actuator": {"goal": 3 * rows[:48]},
     }
     episode = Episode(

@@ -137,7 +137,7 @@ def test_a_recorded_motion_of_the_pendulum_is_checked_and_played(tmp_path, capsy
     assert cli.main(["record", "pendulum", "--excitation", str(tmp_path / "v.csv"), *runs]) == 0
     assert "motion: command of v.csv, 3.0 s" in capsys.readouterr().err
     log = read_log(newest(tmp_path / "runs", "pendulum", "record").output("log"))
-    sent = log.outputs["agent"]["action"].ravel()
+    sent = log.outputs["agent"]["command"].ravel()
     np.testing.assert_allclose(sent, volts[: len(sent)], atol=1e-6)
     assert log.duration_s == pytest.approx(3.0, abs=0.05)
 
@@ -148,7 +148,7 @@ def test_a_log_is_a_motion_that_the_arm_reaches_slowly(tmp_path):
     rows = goals(path)
     assert cli.main(["record", "so101", "--excitation", str(path), "--dry-run", "--runs", str(tmp_path)]) == 0
     (folder,) = tmp_path.glob("so101/*/record")
-    planned = read_log(folder / "session.mcap").outputs["agent"]["goal"]
+    planned = read_log(folder / "session.mcap").outputs["agent"]["command"]
     start = np.array(load_module(ARM.name, "plant").SO101Plant().data.qpos)
     np.testing.assert_allclose(planned[0], start, atol=0.02)
     assert np.abs(np.diff(planned, axis=0)).max() * 50 < 8.0

@@ -84,7 +84,7 @@ def test_a_dry_run_sends_nothing_that_moves_and_is_no_recording(tmp_path):
     assert (manifest["status"], manifest["dry_run"], manifest["exit_code"]) == ("dry run", True, 0)
     episode = read_log(folder / "session.mcap")
     assert episode.metadata["dry_run"] is True
-    wanted, sent = (episode.outputs[n]["action"][:, 0] for n in ("agent", "actuator"))
+    wanted, sent = episode.outputs["agent"]["command"][:, 0], episode.outputs["actuator"]["action"][:, 0]
     assert np.abs(wanted).max() > 1.0
     assert np.abs(sent).max() > 0.5
     (row,) = re.findall(r"^ *0 +hinge +V +50 +(\S+) +(\S+) +(\S+)$", said, re.MULTILINE)

@@ -191,7 +191,7 @@ def agent(robot: Any, runner: Callable[[np.ndarray], np.ndarray], trial: int) ->
         now: Any = StepState(state=state, params=params, inputs=heard, seq=k)
         after, decision = node.act(now, np.asarray(runner(node.observe(now)), np.float32))
         state = after.state
-        return np.asarray(decision.goal)
+        return np.asarray(decision.command)
 
     return act
 

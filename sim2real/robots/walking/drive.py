@@ -44,19 +44,6 @@ class BodyReading(Base):
 
 
 @pytree.dataclass
-class WalkDecision(Base):
-    """The agent's message.
-
-    Attributes:
-        q: Shape ``(joints,)``: targets of the joints [rad].
-        aim: Shape ``(3,)``: the commanded velocity: forwards, to the left [m/s], yaw rate [rad/s].
-    """
-
-    q: Array
-    aim: Array
-
-
-@pytree.dataclass
 class LegCommand(Base):
     """The command of the motors, each ``(joints,)``: its torque is ``tau + kp (q - position) + kd (dq - velocity)``.
 

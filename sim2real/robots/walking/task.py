@@ -20,7 +20,7 @@ from sim2real.robots.agent import AgentParams, PolicyAgent
 from sim2real.robots.loop import AGENT, WORLD, Draw
 from sim2real.robots.messages import EpisodeStart
 from sim2real.robots.robot import GRAVITY, Judgement, RobotTask
-from sim2real.robots.walking.drive import BodyReading, WalkDecision, gravity_of, into_base
+from sim2real.robots.walking.drive import BodyReading, gravity_of, into_base
 from sim2real.types import Array, Key, Scalar
 
 
@@ -172,15 +172,12 @@ class WalkingNode(PolicyAgent):
         commands: Commands,
         **options: Unpack[NodeOptions],
     ) -> None:
-        super().__init__(AGENT, rate, len(stance), history, (6 + 3 * len(stance),), **options)
-        self._stance, self._scale, self._commands = np.asarray(stance, np.float32), np.float32(scale), commands
+        aims = commands.size, commands.at
+        super().__init__(AGENT, rate, len(stance), history, (6 + 3 * len(stance),), *aims, **options)
+        self._stance, self._scale = np.asarray(stance, np.float32), np.float32(scale)
 
     def init_params(self, rng: Key | None = None, graph_state: GraphState | None = None) -> AgentParams:
-        return AgentParams(aim=np.zeros(self._commands.size, np.float32), start=self._stance)
-
-    def commanded(self, step_state: StepState) -> Array:
-        """Return the commanded velocity ``(3,)`` of a step: forwards, to the left [m/s], yaw rate [rad/s]."""
-        return self._commands.at(step_state.params.aim, step_state.seq / self.rate)
+        return super().init_params().replace(start=self._stance)
 
     def features(self, reading: BodyReading, step_state: StepState) -> Array:
         last = step_state.state.last
@@ -188,18 +185,10 @@ class WalkingNode(PolicyAgent):
         return namespace(reading.position, last).concatenate(parts).astype(np.float32)
 
     def shown(self, features: Array, step_state: StepState) -> Array:
-        return namespace(features).concatenate([features, self.commanded(step_state)])
+        return namespace(features).concatenate([features, self.aim(step_state)])
 
     def command(self, before: Array, action: Array) -> Array:
         return self._stance + self._scale * action
-
-    def message(self, command: Array, step_state: StepState) -> WalkDecision:
-        commanded = self.commanded(step_state)
-        return WalkDecision(command, namespace(commanded).asarray(commanded, np.float32))
-
-    def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> WalkDecision:
-        start = self._params(graph_state).start
-        return WalkDecision(namespace(start).asarray(start, np.float32), np.zeros(3, np.float32))
 
 
 class WalkingTask(RobotTask):

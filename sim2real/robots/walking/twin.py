@@ -147,7 +147,7 @@ def walk(
     robot, period_s = twin.robot, 1.0 / twin.robot.drive.rate_hz
     steps = round(seconds * robot.drive.rate_hz)
     node: Any = robot.task.make_agent(robot.drive.rate_hz)
-    node.commanded = lambda step_state: np.asarray(command(step_state.seq * period_s), np.float32)
+    node.aim = lambda step_state: np.asarray(command(step_state.seq * period_s), np.float32)
     params = in_numpy(node.init_params())
     state = in_numpy(node.init_state(None, GraphState(params={AGENT: params})))
     velocity, wanted, qpos = np.zeros((steps, 3)), np.zeros((steps, 3)), np.zeros((steps, twin.model.nq))
@@ -159,7 +159,7 @@ def walk(
         step_state: Any = StepState(state=state, params=params, inputs=heard, seq=i)
         after, decision = node.act(step_state, np.asarray(runner(node.observe(step_state)), np.float32))
         state, wanted[i] = after.state, decision.aim
-        twin.send(decision.q)
+        twin.send(decision.command)
         twin.advance(period_s)
         # Judge by the true motion; what follows a new command or a push does not count as an error.
         velocity[i, :2] = into_base(twin.data.qpos[3:7], twin.data.qvel[:3])[:2]
