@@ -106,14 +106,15 @@ from sim2real.hardware.unitree.legs import LegDrive
 from sim2real.log.writer import McapRecorder
 from sim2real.robots.nodes import Excitation, ServoActuator, ServoSensor
 from sim2real.robots.loop import ACTUATOR, AGENT, SENSOR, control_nodes
-from sim2real.robots.walking.drive import WalkingDrive, leg_command
+from sim2real.robots.walking.drive import leg_command
 from sim2real.runtime.asynchronous import AsyncGraph
 from pipelines.go2.plant import LYING
+from pipelines.go2.robot import ROBOT
 
 device = UnitreeLegs({port!r}, drive=LegDrive(lie_s=3.0), silence_s=0.6, max_silence_s=1.0)
 low, high = device.reach()
 gate = GateConfig((low.tolist(), high.tolist()), stale=device.commanded.stale, command_timeout_s=2.0)
-body = WalkingDrive(Path(), device.motors, LYING, 50.0, (60.0, 4.0))
+body = ROBOT.drive
 
 # It stands up within 0.6 s.
 stood = np.clip(np.arange(3000) / 30.0, 0.0, 1.0)[:, None]

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -24,6 +23,7 @@ if TYPE_CHECKING:
     from sim2real.hardware.device import Device, Reading
     from sim2real.hardware.safety.gate import GateConfig, GateLimits
     from sim2real.hardware.safety.rig import Rig
+    from sim2real.robots.walking.robot import ComposedRobot
 
 
 @pytree.dataclass
@@ -142,11 +142,7 @@ class StandUp:
 class WalkingDrive(RobotDrive):
     """Encoders and the IMU's orientation and gyro; targets of all joints, with the same gains for all motors.
 
-    Args:
-        mjcf: The model, whose ranges of the joints are those of the targets.
-        gains: kp [N m/rad] and kd [N m s/rad] while the policy runs.
-        motors: The motors; None: the robot has no device, and its policy walks on the twin alone.
-        noise: Field of the reading -> deviation and bias of the noise without an identification, in the field's unit.
+    Without motors the robot has no device, and its policy walks on the twin alone.
     """
 
     centre: np.ndarray
@@ -157,28 +153,21 @@ class WalkingDrive(RobotDrive):
     )
     expected_delay_s = (0.002, 0.003, 0.002)
 
-    def __init__(
-        self,
-        mjcf: Path,
-        joints: Sequence[str],
-        stance: Sequence[float],
-        rate_hz: float,
-        gains: tuple[float, float],
-        motors: LegMotors | None = None,
-        noise: Mapping[str, tuple[float, float]] = MappingProxyType({}),
-    ) -> None:
-        self._mjcf, self._joints, self.centre, self.rate_hz = mjcf, tuple(joints), np.asarray(stance), rate_hz
-        self._motors = motors
-        self.crouch = _BENT * (np.asarray(motors.folded) - self.centre) if motors else np.zeros_like(self.centre)
-        self.message: Callable[[Any], LegCommand] = partial(leg_command, kp=gains[0], kd=gains[1])
+    def __init__(self, robot: ComposedRobot) -> None:
+        self._mjcf, self._joints, self._motors, self.rate_hz = robot.mjcf, robot.joints, robot.motors, robot.policy_hz
+        self.centre, stance = np.asarray(robot.stance), np.asarray(robot.stance, np.float32)
+        still = np.zeros_like(self.centre)
+        self.crouch = _BENT * (np.asarray(self._motors.folded) - self.centre) if self._motors else still
+        kp, kd = robot.gains
+        self.message: Callable[[Any], LegCommand] = partial(leg_command, kp=kp, kd=kd)
         self.channels = tuple(
-            Channel("position", "velocity", 5e-4, 0.03, index=i, label=name, goal="q") for i, name in enumerate(joints)
+            Channel("position", "velocity", 5e-4, 0.03, index=i, label=name, goal="q")
+            for i, name in enumerate(self._joints)
         )
-        lying = np.asarray(stance, np.float32)
-        self.at_rest = BodyReading(lying, np.zeros_like(lying), np.array([1.0, 0, 0, 0]), np.zeros(3))
+        self.at_rest = BodyReading(stance, np.zeros_like(stance), np.array([1.0, 0, 0, 0]), np.zeros(3))
         self.noise = tuple(
             Noise(f"{field}[{i}]", self.units[field], deviation, 0.0, bias)
-            for field, (deviation, bias) in noise.items()
+            for field, (deviation, bias) in robot.noise.items()
             for i in range(len(np.ravel(getattr(self.at_rest, field))))
         )
 

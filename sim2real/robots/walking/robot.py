@@ -11,7 +11,6 @@ from types import MappingProxyType
 from typing import ClassVar
 
 import jax
-import numpy as np
 
 from sim2real.robots.loop import DELAYS
 from sim2real.robots.robot import Robot
@@ -19,7 +18,7 @@ from sim2real.robots.walking.body import Terrain
 from sim2real.robots.walking.drive import LegMotors, WalkingDrive
 from sim2real.robots.walking.stand import LegsInAStand
 from sim2real.robots.walking.task import Commands, Moment, Term, WalkingTask
-from sim2real.robots.walking.world import STRENGTH, Ground, JointParameters, WalkingModel
+from sim2real.robots.walking.world import WalkingModel
 
 
 class ComposedRobot(Robot):
@@ -61,14 +60,10 @@ class ComposedRobot(Robot):
     groups: ClassVar[Mapping[str, tuple[int, ...]]] = MappingProxyType({})
     noise: ClassVar[Mapping[str, tuple[float, float]]] = MappingProxyType({})
 
+    model: WalkingModel
+
     def __init__(self) -> None:
-        stance = np.asarray(self.stance, np.float32)
-        motors = self.policy_hz, self.gains, self.motors, self.noise
-        self.drive = WalkingDrive(self.mjcf, self.joints, self.stance, *motors)
-        joints = JointParameters(self.joints, self.groups or {"joint": range(len(self.joints))})
-        self.model: WalkingModel = WalkingModel(self.make_task, joints, self.height_m, self.terrain)
-        policy = self.commands, self.joints, stance, self.scale, self.history
-        self.task = WalkingTask(*policy, 1.0 / self.drive.rate_hz, self.terms(), self.falls)
+        self.drive, self.model, self.task = WalkingDrive(self), WalkingModel(self), WalkingTask(self)
 
     @abstractmethod
     def terms(self) -> Mapping[str, Term]:
@@ -77,11 +72,6 @@ class ComposedRobot(Robot):
     def falls(self, now: Moment) -> jax.Array:
         """Return whether the robot has fallen: it lies lower than half of its height, or on its side."""
         return (now.height < 0.5 * self.height_m) | (now.gravity[2] > -0.5)
-
-    def make_task(self, rough: bool = False) -> Ground:
-        """Return the composed task; in training the floor sees the feet alone."""
-        ground = self.terrain.growing() if rough else None
-        return Ground(self.mjcf, self.feet, self.touching_m, self.feet, ground)
 
     def commanded(self, command: tuple[float, float, float]) -> ComposedRobot:
         """Return the robot with this command in all trials."""
@@ -94,7 +84,4 @@ class ComposedRobot(Robot):
         return super().nominal() | dict(zip(DELAYS, self.delays_s, strict=True))
 
     def identifiable(self, max_delay_s: float) -> LegsInAStand:
-        # The strengths of the motors take the place of a factor on all of them.
-        fixed = [replace(p, free=False) for p in self.model.around() if p.name == STRENGTH]
-        loop = self.drive.channels, self.drive.rate_hz, self.gains[1]
-        return LegsInAStand(self.mjcf, self.model.joints, fixed, *loop, max_delay_s)
+        return LegsInAStand(self, max_delay_s)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -12,17 +14,19 @@ import numpy as np
 from sim2real.errors import OtherMotion
 from sim2real.graph.episode import Episode
 from sim2real.graph.node import BaseNode
-from sim2real.identification.model import Channel
-from sim2real.identification.parameters import Parameter, ParameterTable
+from sim2real.identification.parameters import ParameterTable
 from sim2real.robots.loop import ACTUATOR, SENSOR, WORLD, DelayParams, delay_parameters, recorded_loop
 from sim2real.robots.model.drives import EncoderParams, Encoders, driven_spec
 from sim2real.robots.model.file import read_spec
 from sim2real.robots.walking.drive import gravity_of
-from sim2real.robots.walking.world import MOTOR_STRENGTH, JointParameters
+from sim2real.robots.walking.world import MOTOR_STRENGTH, STRENGTH
 from sim2real.types import Array, MjModel, PyTree, Scalar
 from sim2real.worlds.driven import DriveCommand, DrivenWorld
 from sim2real.worlds.mjx import MjxState
 from sim2real.worlds.recorded import RecordedActuator
+
+if TYPE_CHECKING:
+    from sim2real.robots.walking.robot import ComposedRobot
 
 STEP_S, FINE_S = 0.002, 0.001
 """Time step of the simulation, and the shorter one for which parameters hold [s]: a step acts as armature, of half the
@@ -35,24 +39,17 @@ class LegsInAStand:
     """Simulates what the encoders of legs in a stand measure; an ``identification.model.IdentifiableModel``.
 
     Args:
-        fixed: Parameters of training that the log of a stand replaces by others.
-        kd: Gain of the velocity with which logs are recorded [N m s/rad].
         max_delay_s: Upper bound of each delay [s].
     """
 
-    def __init__(
-        self,
-        mjcf: Path,
-        joints: JointParameters,
-        fixed: Sequence[Parameter],
-        channels: tuple[Channel, ...],
-        rate_hz: float,
-        kd: float,
-        max_delay_s: float,
-    ) -> None:
-        self.sensor, self.channels, self.ahead_s, self._rate_hz = SENSOR, channels, STEP_S, rate_hz
-        self._joints, self._model, self._kd = joints, stand_model(mjcf), kd
-        rows = [*joints.dynamics(), *fixed, *joints.zeros(), *delay_parameters(max_delay_s)]
+    sensor, ahead_s = SENSOR, STEP_S
+
+    def __init__(self, robot: ComposedRobot, max_delay_s: float) -> None:
+        self.channels, self._rate_hz, self._kd = robot.drive.channels, robot.policy_hz, robot.gains[1]
+        self._joints, self._model = robot.model.joints, stand_model(robot.mjcf)
+        # The strengths of the motors take the place of a factor on all of them.
+        fixed = [replace(p, free=False) for p in robot.model.around() if p.name == STRENGTH]
+        rows = [*self._joints.dynamics(), *fixed, *self._joints.zeros(), *delay_parameters(max_delay_s)]
         self.parameters = ParameterTable(rows)
         columns: dict[str, PyTree] = {"goal": "q", "goal_velocity": "dq", "torque": "tau", "kp": "kp", "kd": "kd"}
         self.given: Mapping[str, PyTree] = {ACTUATOR: DriveCommand(**columns)}

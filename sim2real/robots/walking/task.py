@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import NamedTuple, Unpack
+from typing import TYPE_CHECKING, NamedTuple, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,9 @@ from sim2real.robots.messages import EpisodeStart
 from sim2real.robots.robot import GRAVITY, Judgement, RobotTask
 from sim2real.robots.walking.drive import BodyReading, gravity_of, into_base
 from sim2real.types import Array, Key, Scalar
+
+if TYPE_CHECKING:
+    from sim2real.robots.walking.robot import ComposedRobot
 
 
 @dataclass(frozen=True)
@@ -146,8 +149,8 @@ class Moment(NamedTuple):
         return (1.0 - self.moving) * jnp.sum(~self.touches)
 
 
-_GAIT_S = 0.4
-"""A step of the gait, over which a velocity is averaged [s]."""
+_GAIT_S, _CLOSE = 0.4, 0.2
+"""A step of the gait, over which a velocity is averaged [s]; largest error of it that is a success [m/s, rad/s]."""
 Term = tuple[float, Callable[[Moment], jax.Array | float]]
 """A weight, and a measure of a moment."""
 
@@ -156,25 +159,12 @@ class WalkingNode(PolicyAgent):
     """Sends joint targets around the stance.
 
     Its features are gyro, gravity, joints beside the stance, and the last action. The history has features alone.
-
-    Args:
-        stance: Shape ``(joints,)``: targets of the action 0 [rad].
-        scale: Change of a target by the action 1 [rad].
-        history: Number of earlier observations that the policy gets.
     """
 
-    def __init__(
-        self,
-        rate: float,
-        stance: np.ndarray,
-        scale: float,
-        history: int,
-        commands: Commands,
-        **options: Unpack[NodeOptions],
-    ) -> None:
-        aims = commands.size, commands.at
-        super().__init__(AGENT, rate, len(stance), history, (6 + 3 * len(stance),), *aims, **options)
-        self._stance, self._scale = np.asarray(stance, np.float32), np.float32(scale)
+    def __init__(self, robot: ComposedRobot, rate: float, **options: Unpack[NodeOptions]) -> None:
+        self._stance, self._scale = np.asarray(robot.stance, np.float32), np.float32(robot.scale)
+        count, aims = len(robot.stance), (robot.commands.size, robot.commands.at)
+        super().__init__(AGENT, rate, count, robot.history, (6 + 3 * count,), *aims, **options)
 
     def init_params(self, rng: Key | None = None, graph_state: GraphState | None = None) -> AgentParams:
         return super().init_params().replace(start=self._stance)
@@ -195,32 +185,13 @@ class WalkingTask(RobotTask):
     """Follow velocities, without a fall.
 
     The policy sees gyro, gravity, joints, last actions, and the commanded velocity.
-
-    Args:
-        scale: Change of a target by the action 1 [rad].
-        history: Earlier observations that the policy gets.
-        terms: Name -> weight and measure, whose product is a term of the reward.
-        falls: Returns whether a robot has fallen, from height and gravity of a moment.
-        close: Largest error of the mean velocity that counts as success [m/s, rad/s].
     """
 
     units = MappingProxyType({"aim": "m/s, m/s, rad/s"})
 
-    def __init__(
-        self,
-        commands: Commands,
-        joints: Sequence[str],
-        stance: np.ndarray,
-        scale: float,
-        history: int,
-        period_s: float,
-        terms: Mapping[str, Term],
-        falls: Callable[[Moment], jax.Array],
-        close: float = 0.2,
-    ) -> None:
-        self._commands, self._stance, self._period_s = commands, np.asarray(stance, np.float32), period_s
-        self._terms, self._falls, self._close = terms, falls, close
-        self._scale, self._history, n = scale, history, len(joints)
+    def __init__(self, robot: ComposedRobot) -> None:
+        self._robot, self._commands, n = robot, robot.commands, len(robot.joints)
+        self._stance, self._terms = np.asarray(robot.stance, np.float32), robot.terms()
         units = ("rad/s",) * 3 + ("1",) * 3 + ("rad",) * n + ("rad/s",) * n + ("1",) * n
         now = (
             ObservationTerm("gyro", units[:3]),
@@ -230,12 +201,12 @@ class WalkingTask(RobotTask):
             ObservationTerm("last action", units[6 + 2 * n :]),
             ObservationTerm("command: forwards, left, yaw rate", ("m/s", "m/s", "rad/s")),
         )
-        past = (ObservationTerm("earlier features, newest first", units, history),) if history else ()
-        self.observation = (*now, *past)
-        self.action = tuple(ActionTerm(name, "1", -1.0, 1.0) for name in joints)
+        past = ObservationTerm("earlier features, newest first", units, robot.history) if robot.history else None
+        self.observation = (*now, past) if past else now
+        self.action = tuple(ActionTerm(name, "1", -1.0, 1.0) for name in robot.joints)
 
     def make_agent(self, rate_hz: float, **options: Unpack[NodeOptions]) -> WalkingNode:
-        return WalkingNode(rate_hz, self._stance, self._scale, self._history, self._commands, **options)
+        return WalkingNode(self._robot, rate_hz, **options)
 
     def random(self, key: Key, draw: Draw) -> tuple[dict, EpisodeStart]:
         k_values, k_commands = jax.random.split(key)
@@ -251,9 +222,9 @@ class WalkingTask(RobotTask):
 
     def moment(self, graph_state: GraphState) -> Moment:
         """Return what a reward sees."""
-        world, agent = graph_state.state[WORLD], graph_state.state[AGENT]
+        world, agent, period_s = graph_state.state[WORLD], graph_state.state[AGENT], 1.0 / self._robot.policy_hz
         data, v = world.data, world.variables
-        t_s = (graph_state.step - 1) * self._period_s
+        t_s = (graph_state.step - 1) * period_s
         turn, feet = data.qpos[3:7], v["at_m"]
         moment = Moment(
             command=jnp.asarray(self._commands.at(graph_state.params[AGENT].aim, t_s)),
@@ -267,17 +238,17 @@ class WalkingTask(RobotTask):
             last=agent.last,
             before=agent.before,
             touches=v["air_s"] == 0.0,
-            lands=(v["ground_s"] > 0.0) & (v["ground_s"] < self._period_s + 1e-4) & (v["swing_s"] > 0.0),
+            lands=(v["ground_s"] > 0.0) & (v["ground_s"] < period_s + 1e-4) & (v["swing_s"] > 0.0),
             swing_s=v["swing_s"],
             slip_m_s=v["slip_m_s"],
             falls=jnp.bool_(False),
         )
-        return moment._replace(falls=self._falls(moment))
+        return moment._replace(falls=self._robot.falls(moment))
 
     def judge(self, graph_state: GraphState, action: jax.Array) -> Judgement:
         now = self.moment(graph_state)
         terms = {name: jnp.float32(weight * measure(now)) for name, (weight, measure) in self._terms.items()}
-        return Judgement(terms, jnp.all(jnp.abs(now.mean - now.command) < self._close), now.falls)
+        return Judgement(terms, jnp.all(jnp.abs(now.mean - now.command) < _CLOSE), now.falls)
 
     def score(self, t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float]:
         """Return how well a deployment went: share of the time upright, largest tilt, and errors of the velocity.
@@ -289,7 +260,7 @@ class WalkingTask(RobotTask):
         turn = turn / np.linalg.norm(turn, axis=-1, keepdims=True)
         upright = 1.0 - 2.0 * (turn[:, 1] ** 2 + turn[:, 2] ** 2)
         # The commands change at policy steps, the states have times of their own.
-        step = ((t_s - t_s[0]) / self._period_s + 1e-6).astype(int)
+        step = ((t_s - t_s[0]) * self._robot.policy_hz + 1e-6).astype(int)
         off = []
         for name, aim in (("linear[0]", "aim[0]"), ("linear[1]", "aim[1]"), ("gyro[2]", "aim[2]")):
             wanted = states[aim][np.minimum(step, len(states[aim]) - 1)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,7 +22,7 @@ from sim2real.identification.parameters import Parameter
 from sim2real.robots.loop import ACTUATOR, WORLD
 from sim2real.robots.messages import EpisodeStart
 from sim2real.robots.robot import RobotModel
-from sim2real.robots.walking.body import FLOOR, HeightField, Terrain
+from sim2real.robots.walking.body import FLOOR, HeightField
 from sim2real.robots.walking.drive import BodyReading
 from sim2real.types import Array, PyTree, Scalar
 from sim2real.worlds.composed import ComposedWorld, WorldParams
@@ -30,6 +30,7 @@ from sim2real.worlds.composed import ComposedWorld, WorldParams
 if TYPE_CHECKING:
     from sim2real.composer.mjx_environment import State
     from sim2real.composer.physics.mjx.physics import MjxPhysics
+    from sim2real.robots.walking.robot import ComposedRobot
 
 FRICTION, STRENGTH, ROUGHNESS = "foot_friction", "motor_strength", "roughness"
 PAYLOAD, ARMATURE, MOTOR_STRENGTH = "payload", "armature", "strength"
@@ -259,27 +260,19 @@ class WalkingModel(RobotModel):
     """A composed task on MJX: on Warp if JAX computes on a GPU, as MJX's JAX is 20 times slower with contacts there.
 
     Args:
-        joints: Parameters of the joints, in the order of the actuators.
-        height_m: Height of the base at the start of an episode [m].
-        terrain: Largest roughness, and where in the task's ground it is.
-        make_task: Makes the composed task; True: on rough ground.
+        rough: Whether the robot is on its rough ground.
     """
 
-    def __init__(
-        self,
-        make_task: Callable[[bool], Ground],
-        joints: JointParameters,
-        height_m: float,
-        terrain: Terrain,
-        rough: bool = False,
-    ) -> None:
-        self._make_task, self.joints, self._height_m, self._terrain = make_task, joints, height_m, terrain
-        self._rough = rough
+    def __init__(self, robot: ComposedRobot, rough: bool = False) -> None:
+        self._robot, self._rough = robot, rough
+        self.joints = JointParameters(robot.joints, robot.groups or {"joint": range(len(robot.joints))})
 
     @cached_property
     def task(self) -> Ground:
-        """The composed task."""
-        return self._make_task(self._rough)
+        """The composed task; in training the floor sees the feet alone."""
+        robot = self._robot
+        ground = robot.terrain.growing() if self._rough else None
+        return Ground(robot.mjcf, robot.feet, robot.touching_m, robot.feet, ground)
 
     @property
     def tick_s(self) -> float:
@@ -294,20 +287,22 @@ class WalkingModel(RobotModel):
             Parameter(FRICTION, "1", 0.8, 0.2, 2.0, about="friction of the feet on the ground"),
             Parameter(PAYLOAD, "kg", 0.0, *LOADS_KG, "linear", about="load in the base"),
             Parameter(STRENGTH, "1", 1.0, 0.5, 1.5, about="factor on the motors' gains"),
-            Parameter(ROUGHNESS, "m", 0.0, 0.0, self._terrain.most_m, "linear", about="height of bumps of the ground"),
+            Parameter(
+                ROUGHNESS, "m", 0.0, 0.0, self._robot.terrain.most_m, "linear", about="height of bumps of the ground"
+            ),
         ]
 
     def for_training(self, values: Mapping[str, float], draws: Mapping[str, np.ndarray]) -> WalkingModel:
         bumps_m = np.asarray(draws.get(ROUGHNESS, values.get(ROUGHNESS, 0.0)))
         if not bumps_m.any():
             return self
-        low, high, most_m = float(bumps_m.min()), float(bumps_m.max()), self._terrain.most_m
+        low, high, most_m = float(bumps_m.min()), float(bumps_m.max()), self._robot.terrain.most_m
         if low < 0.0 or high > most_m:
             raise UsageError(
                 f"roughness must lie in [0, {most_m:g}] m, got {low:.3g} to {high:.3g}",
                 hint="`terrain = Terrain(most_m=0.2)` in the robot's file makes its ground rougher",
             )
-        return WalkingModel(self._make_task, self.joints, self._height_m, self._terrain, rough=True)
+        return WalkingModel(self._robot, rough=True)
 
     def make_world(self, resumed: bool = False) -> WalkingWorld:
         del resumed
@@ -339,8 +334,8 @@ class WalkingModel(RobotModel):
             PAYLOAD: jnp.asarray(values[PAYLOAD], jnp.float32),
         }
         bumps_m = jnp.asarray(values[ROUGHNESS] if self.task.rough else 0.0, jnp.float32)
-        x_m = self._terrain.start_m(bumps_m) if self.task.rough else 0.0
-        base = jnp.array([x_m, 0.0, self._height_m + bumps_m, 1.0, 0.0, 0.0, 0.0], jnp.float32)
+        x_m = self._robot.terrain.start_m(bumps_m) if self.task.rough else 0.0
+        base = jnp.array([x_m, 0.0, self._robot.height_m + bumps_m, 1.0, 0.0, 0.0, 0.0], jnp.float32)
         position, velocity = (jnp.asarray(x, jnp.float32) for x in (start.position, start.velocity))
         return WorldParams(placed, jnp.concatenate([base, position]), jnp.concatenate([jnp.zeros(6), velocity]))
 
