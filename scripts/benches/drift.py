@@ -22,7 +22,7 @@ import numpy as np
 from benches import jobs
 from benches.hidden import arms
 from benches.hidden.robots import RATE_HZ, write_log
-from benches.rows import Report, Row, markdown, row, share
+from benches.rows import Report, Row, row, share
 from sim2real.errors import Sim2RealError
 from sim2real.hardware.safety.gate import SafetyGate
 from sim2real.stages.load import load_robot
@@ -190,5 +190,10 @@ def table(report: Mapping[str, Any]) -> str:
     """Return the number of robots for which the verdict was to identify again, by change."""
     counts = {r["name"].removeprefix("drift/so101/"): (r["value"], r["unit"]) for r in report["rows"]}
     whats = ["none/false_alarms", *(f"{change}/detected" for change in list(CAUSES)[1:])]
-    cells = [f"{round(value * int(unit.split()[1]))} {unit}" for value, unit in map(counts.__getitem__, whats)]
-    return markdown(["robots", "unchanged", "friction doubled", "payload +30 %", "15 ms more"], [["SO-101s", *cells]])
+    sound, friction, payload, delay = (
+        f"{round(v * int(unit.split()[1]))} {unit}" for v, unit in map(counts.get, whats)
+    )
+    return (
+        f"The verdict is `re-identify` for {sound} unchanged SO-101s, {friction} with friction doubled, {payload} with "
+        f"30 % more payload, and {delay} with 15 ms more delay.\n"
+    )
