@@ -2,24 +2,22 @@
 
 A way is a ``Setting``, of what differs from the contract:
 
-| name | value |
-|---|---|
-| a kind of a term, ``action_scale`` | factor beside the contract's scale |
-| ``degrees KIND`` | whether the joints' angles or rates are in degrees before the pose is taken off |
-| ``order SIDE`` | entry i of the policy is joint ``order[i]`` of the contract; sides: ``seen``, ``moved`` |
-| ``signs SIDE``, ``turned SIDE`` | signs of the entries: of the distance from the default pose, of the angle itself |
-| ``pose SIDE`` | what the default pose has too much [rad] |
-| ``frame KIND`` | a key of ``FRAMES``, or the signed axes of a vector, such as ``(2, 1, -3)`` |
-| ``late`` | age of the measurements beyond the newest in the log [s] |
-| ``stale`` | steps by which a whole observation is older |
-| ``frozen`` | share of the log after which gyro and gravity in the observation do not change |
-| ``stuck`` | (joint, share): after which a joint in the observation does not change |
-| ``history`` | ``reversed``, ``layout``: by step and not by term, or the reverse; ``newest`` in all places |
-| ``terms`` | term i of the observation is term ``terms[i]`` of the contract |
-| ``last_action is`` | ``older``: that of the step before; ``target``: after scale and pose |
-| ``clipped`` | whether actions end at the logged range |
-| ``normalised`` | how often the normaliser is applied |
-| ``gain``, ``bias`` | of each entry of the observation: another normaliser |
+- a kind of a term, ``action_scale``: factor beside the contract's scale
+- ``degrees KIND``: whether the joints' angles or rates are in degrees before the pose is taken off
+- ``order SIDE``: entry i of the policy is joint ``order[i]`` of the contract; sides: ``seen``, ``moved``
+- ``signs SIDE``, ``turned SIDE``: signs of the entries: of the distance from the default pose, of the angle itself
+- ``pose SIDE``: what the default pose has too much [rad]
+- ``frame KIND``: a key of ``FRAMES``, or the signed axes of a vector, such as ``(2, 1, -3)``
+- ``late``: age of the measurements beyond the newest in the log [s]
+- ``stale``: steps by which a whole observation is older
+- ``frozen``: share of the log after which gyro and gravity in the observation do not change
+- ``stuck``: (joint, share): after which a joint in the observation does not change
+- ``history``: ``reversed``, ``layout``: by step and not by term, or the reverse; ``newest`` in all places
+- ``terms``: term i of the observation is term ``terms[i]`` of the contract
+- ``last_action is``: ``older``: that of the step before; ``target``: after scale and pose
+- ``clipped``: whether actions end at the logged range
+- ``normalised``: how often the normaliser is applied
+- ``gain``, ``bias``: of each entry of the observation: another normaliser
 """
 
 from __future__ import annotations
