@@ -460,15 +460,23 @@ class Identification(Shown):
         return {name: value for name, value in facts.items() if value}
 
     def rows(self) -> ArtifactTable:
-        """Return a row for each parameter; of the delays their sum alone, which is what a log determines."""
+        """Return a row for each parameter; of the delays their sum alone, which is what a log determines.
+
+        Only an embedded robot has the columns of the truth.
+        """
         summed = any(p.name == ROUND_TRIP for p in self.parameters)
+        known = any(p.truth is not None for p in self.parameters)
         rows = [
-            [p.name, p.estimate, Interval(p.low95, p.high95), p.unit, p.nominal, p.truth, _off(p), p.verdict]
+            [
+                *(p.name, p.estimate, Interval(p.low95, p.high95), p.unit, p.nominal),
+                *((p.truth, _off(p)) if known else ()),
+                p.verdict,
+            ]
             for p in self.parameters
             if not p.absent and not (summed and p.kind == "delay")
         ]
-        headers = ("parameter", "estimate", "95 % interval", "unit", "nominal", "truth", "off by", "verdict")
-        return ArtifactTable(headers, rows)
+        truth = ("truth", "off by") if known else ()
+        return ArtifactTable(("parameter", "estimate", "95 % interval", "unit", "nominal", *truth, "verdict"), rows)
 
     def recordings_table(self) -> ArtifactTable:
         """Return a row for each quantity that is estimated from each recording alone."""

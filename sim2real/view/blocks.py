@@ -236,13 +236,6 @@ def interval(low: float | None, high: float | None, digits: int = 4) -> str:
     return MISSING if low is None or high is None else f"{number(low, digits)} to {number(high, digits)}"
 
 
-def decimals_for(error: float | None, value: float) -> int:
-    """Return the number of decimals that shows two digits of a value's standard error; without one, four digits."""
-    if not error or not math.isfinite(error):
-        return max(0, 3 - math.floor(math.log10(abs(value)))) if value and math.isfinite(value) else 3
-    return min(9, max(0, 1 - math.floor(math.log10(error))))
-
-
 def pretty_unit(unit: str) -> str:
     """Return a unit or a formula with powers as superscripts."""
     return unit.replace("^2", "²").replace("^3", "³") or "1"

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 
 from sim2real.artifacts.identification import (
-    Estimate,
     Identification,
     Link,
     links_table,
@@ -16,7 +15,6 @@ from sim2real.artifacts.run import StageFolder
 from sim2real.artifacts.summary import ArtifactTable
 from sim2real.log.schema import unit_of
 from sim2real.view.blocks import (
-    MISSING,
     Banner,
     Block,
     FigureBlock,
@@ -25,9 +23,6 @@ from sim2real.view.blocks import (
     Tile,
     Tone,
     about,
-    decimals_for,
-    fixed,
-    interval,
     number,
     pretty_unit,
     sentence,
@@ -45,7 +40,6 @@ _MOST_COMPARED = 12
 _MAX_PANELS = 6
 _MOST_JOINTS = 6
 """Joints whose expected errors are not folded."""
-_NUMBERS = ("estimate", "nominal", "standard_error", "low95", "high95", "lower", "upper", "truth")
 _AROUND_S = 1.0
 """Time that is drawn before and after the worst second [s]."""
 _GOAL = "told"
@@ -58,7 +52,7 @@ def identify_section(artifact: StageFolder) -> PageSection:
     result = Identification.load(artifact.folder)
     blocks = [
         *_expected(result),
-        _parameter_table(result.parameters),
+        _parameter_table(result),
         *_recordings(result),
         *tried_blocks(result),
         *link_blocks(result.links),
@@ -140,42 +134,11 @@ def worst_figure(result: Identification, name: str) -> FigureBlock | None:
 # -- parameters
 
 
-def _parameter_table(estimates: Sequence[Estimate]) -> TableBlock:
-    estimates = [e for e in estimates if not e.absent]
-    with_truth = any(e.truth is not None for e in estimates)
-    columns = ["parameter", "estimate", "s.e.", "95 % interval", "unit", "nominal", "bounds"]
-    columns += ["truth", "error", "verdict"] if with_truth else ["verdict"]
-    rows = []
-    # Show two digits of the standard error, and as many decimals of the estimate.
-    for e in map(in_readable_unit, estimates):
-        places = decimals_for(e.standard_error, e.estimate)
-        ends = MISSING if e.low95 is None else f"{fixed(e.low95, places)} to {fixed(e.high95, places)}"
-        row = [e.name, fixed(e.estimate, places), fixed(e.standard_error, places), ends, pretty_unit(e.unit)]
-        if e.verdict == "fixed":
-            row[2:4] = [MISSING, MISSING]
-        row += [number(e.nominal), interval(e.lower, e.upper)]
-        if with_truth:
-            row += [fixed(e.truth, places), _error(e)]
-        rows.append([*row, e.verdict or MISSING])
-    remarks = [pretty_unit(e.about) if e.about else "" for e in estimates]
-    return TableBlock("Parameters", columns, rows, text_columns=(4, len(columns) - 1), remarks=remarks)
-
-
-def in_readable_unit(e: Estimate) -> Estimate:
-    """Return an estimate in ms if it is a time below a second; others unchanged."""
-    largest = max(abs(v) for v in (e.estimate, e.upper, e.truth) if v is not None)
-    if e.unit != "s" or largest >= 1.0:
-        return e
-    scaled = {n: getattr(e, n) for n in _NUMBERS}
-    return replace(e, unit="ms", **{n: None if v is None else 1e3 * v for n, v in scaled.items()})
-
-
-def _error(e: Estimate) -> str:
-    if e.truth is None:
-        return MISSING
-    if not e.truth:
-        return number(e.estimate - e.truth, 2)
-    return f"{100 * (e.estimate - e.truth) / abs(e.truth):+.1f} %".replace("-", "\u2212")
+def _parameter_table(result: Identification) -> TableBlock:
+    """Return the table of the console, with what each parameter is."""
+    table = TableBlock.of("Parameters", result.rows())
+    meanings = {e.name: pretty_unit(e.about) if e.about else "" for e in result.parameters}
+    return replace(table, remarks=[meanings[row[0]] for row in table.rows])
 
 
 def _recordings(result: Identification) -> list[Block]:

@@ -45,12 +45,17 @@ def test_a_unit_of_one_side_holds_for_the_other_unless_the_data_contradict_it(tm
     assert found.mapping.nodes["sensor"].fields["position"].unit == "rad"
 
 
-@pytest.mark.parametrize("suffix", ["_ticks", "_percent"])
+@pytest.mark.parametrize("suffix", ["_ticks", "_percent", ""])
 def test_counts_and_percent_are_asked(tmp_path, suffix):
     path = table(tmp_path, f"goal_{{}}{suffix}", f"q_{{}}{suffix}", factor=2048 / np.pi)
     assert {key for _, _, key in proposed(path).questions} == {"unit"}
     episode, _ = imported(path, unit="counts:4096")
     np.testing.assert_allclose(episode.outputs["sensor"]["position"], Q, atol=1e-5)
+
+
+def test_whole_numbers_may_be_counts(tmp_path):
+    np.savez(tmp_path / "run.npz", t_s=T, goal=np.round(652 * GOAL), q=np.round(652 * Q))
+    assert all("counts:4096" in text for text in proposed(tmp_path / "run.npz").questions.values())
 
 
 def test_a_question_stands_in_the_file_and_an_edited_line_answers_it(tmp_path, monkeypatch, capsys):

@@ -389,9 +389,10 @@ class Proposal:
             self.reasons[(*at, "unit")] = reason
         else:
             span = (np.nanmax(signal.values, axis=0) - np.nanmin(signal.values, axis=0)).max()
+            whole = np.array_equal(signal.values, np.round(signal.values), equal_nan=True)
+            usual = '"counts:4096" or "deg"?' if whole and span > checks.TURN_RAD else '"rad" or "deg"?'
             self.questions[(*at, "unit")] = (
-                f'{reason or """"rad" or "deg"?"""}  # it spans up to {span:.4g}, and its name has no unit; --unit '
-                "answers, too"
+                f"{reason or usual}  # it spans up to {span:.4g}, and its name has no unit; --unit answers, too"
             )
         if self.hints.calibration is not None and unit in lerobot.UNITS:
             scale, offset = lerobot.conversion(self.hints.calibration, signal.labels, unit)
