@@ -130,7 +130,7 @@ class ArmRobot(Robot):
 
     def __init__(self, servos: Servos = SERVOS) -> None:
         self.drive = ServoDrive(servos, probe=Probe(step=0.12, lag_s=(0.008, 0.0115)), embedded=embedded)
-        self.model = ServoModel(servos, MJCF, HAND, causes=friction_causes(servos.joints))
+        self.model = ServoModel(servos, MJCF, HAND, causes=friction_causes(servos.names))
         self.task = AimTask(servos, TARGET, reward, success, score, FEATURES, observe)
 
 

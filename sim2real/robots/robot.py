@@ -90,7 +90,6 @@ class RobotDrive(ABC):
         expected_delay_s: Computation delays of sensor, agent and actuator that phases allow for: a bus transaction, and
             a policy with its thread's wake-up [s].
         centre: Commands around which an excitation moves, ``(actions,)``.
-        crouch: Offset from these with which a robot on its feet bends its legs ``(actions,)``; None: it has no feet.
         probe: The steps by which deploy measures the delay; None: the delay is not measured.
     """
 
@@ -103,7 +102,6 @@ class RobotDrive(ABC):
     units: Mapping[str, str]
     expected_delay_s: tuple[float, float, float] = (0.002, 0.002, 0.002)
     centre: np.ndarray | float = 0.0
-    crouch: np.ndarray | None = None
     probe: Probe | None = None
 
     @abstractmethod

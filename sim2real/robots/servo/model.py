@@ -25,13 +25,11 @@ from sim2real.identification.parameters import Parameter
 from sim2real.later import jnp
 from sim2real.robots.messages import EpisodeStart
 from sim2real.robots.robot import PAYLOAD, Embedded, Exported, RobotModel
-from sim2real.robots.servo.servos import DataSheet, Servos, name_of
+from sim2real.robots.servo.servos import DataSheet, Servos
 from sim2real.types import MjModel, MjSpec, PyTree, Scalar
 
 if TYPE_CHECKING:
     from sim2real.emulation.bus import BusEmulation
-    from sim2real.hardware.device import Following
-    from sim2real.hardware.joint import Joint
     from sim2real.robots.servo.world import ServoParams, ServoWorld
 
 mj: Any = mujoco
@@ -103,7 +101,7 @@ class ServoModel(RobotModel):
     def dynamics(self) -> list[Parameter]:
         if self._dynamics is not None:
             return self._dynamics()
-        of_servos = servo_parameters(self.servos.sheet, self.servos.joints)
+        of_servos = servo_parameters(self.servos.sheet, self.servos.names)
         return [*of_servos, self.hand.parameter()] if self.hand else of_servos
 
     def make_world(self, resumed: bool = False) -> ServoWorld:
@@ -127,7 +125,7 @@ class ServoModel(RobotModel):
         s, model, dofs = self.servos, self.model, self._places[1]
         gear, full = np.array(s.gears, np.float32), s.sheet.full_rad
         gain, damping, inertia, friction, limit_rad, offset = (
-            _each(values, name, s.joints, otherwise)
+            _each(values, name, s.names, otherwise)
             for name, otherwise in (*((name, None) for name in _NAMES), ("saturation", full), (OFFSET, 0.0))
         )
         # Motors and joints.
@@ -243,7 +241,7 @@ class ServoModel(RobotModel):
         if self.servos.sheet.stribeck_rad_s is None:
             return None
         gears = np.array(self.servos.gears, np.float32)
-        return _each(values, "stribeck", self.servos.joints, _NEVER) / gears
+        return _each(values, "stribeck", self.servos.names, _NEVER) / gears
 
     def _spec(self, stops: bool = False) -> MjSpec:
         """Return the MJCF with a servo on each joint, and options that make its steps fast.
@@ -300,9 +298,7 @@ _SET = (
 """Fields of the model that the servos' parameters set."""
 
 
-def servo_parameters(
-    sheet: DataSheet, joints: Sequence[Joint | str], own: Sequence[str] = ("friction",)
-) -> list[Parameter]:
+def servo_parameters(sheet: DataSheet, joints: Sequence[str], own: Sequence[str] = ("friction",)) -> list[Parameter]:
     """Return gain, damping, rotor inertia and friction, bounded to factors of 3 to 10 of the data sheet.
 
     If friction decreases with speed, the width of this decrease, ``stribeck``, is a parameter.
@@ -321,23 +317,23 @@ def servo_parameters(
         Parameter(label, unit, value, value / factor, value * factor, about=about, vanishes=name in _NAMES[1:])
         for name, (unit, value, factor, about) in table.items()
         if value is not None
-        for label in ([f"{name}_{name_of(joint)}" for joint in joints] if name in own else [name])
+        for label in ([f"{name}_{joint}" for joint in joints] if name in own else [name])
     ]
 
 
-def goal_offsets(joints: Sequence[Joint | str]) -> list[Parameter]:
+def goal_offsets(joints: Sequence[str]) -> list[Parameter]:
     """Return the offset of each servo from its goals, for ``dynamics``."""
     about, most = "rest position without load, from its goal", _MOST_OFFSET_RAD
-    names = [f"{OFFSET}_{name_of(joint)}" for joint in joints]
+    names = [f"{OFFSET}_{joint}" for joint in joints]
     return [Parameter(name, "rad", 0.0, -most, most, "linear", about=about) for name in names]
 
 
-def friction_causes(joints: Sequence[Joint | str]) -> dict[str, dict[str, float]]:
+def friction_causes(joints: Sequence[str]) -> dict[str, dict[str, float]]:
     """Return the causes that change parameters of all joints: the temperature of grease and gears changes friction."""
-    return {"friction": {f"friction_{name_of(joint)}": 1.0 for joint in joints}}
+    return {"friction": {f"friction_{joint}": 1.0 for joint in joints}}
 
 
-def _each(values: Mapping[str, Scalar], name: str, joints: Sequence[Joint | str], otherwise: float | None) -> PyTree:
+def _each(values: Mapping[str, Scalar], name: str, joints: Sequence[str], otherwise: float | None) -> PyTree:
     """Return the value of every joint's servo ``(joints,)``: its own, otherwise the shared one.
 
     Args:
@@ -345,7 +341,7 @@ def _each(values: Mapping[str, Scalar], name: str, joints: Sequence[Joint | str]
         otherwise: The value without both; None: a missing value is an error.
     """
     shared = values.get(name, otherwise)
-    entries = {f"{name}_{name_of(joint)}": values.get(f"{name}_{name_of(joint)}", shared) for joint in joints}
+    entries = {f"{name}_{joint}": values.get(f"{name}_{joint}", shared) for joint in joints}
     if lacking := [label for label, value in entries.items() if value is None]:
         raise KeyError(lacking[0])
     return jnp.stack([jnp.asarray(value, jnp.float32) for value in entries.values()])

@@ -12,6 +12,7 @@ import numpy as np
 
 from sim2real.errors import SafetyStop
 from sim2real.hardware import dynamixel, feetech
+from sim2real.hardware.joint import Joint
 from sim2real.identification.model import Channel
 from sim2real.robots.loop import ACTUATOR
 from sim2real.robots.messages import Goals, JointReading
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from sim2real.hardware.bus.registers import Family
     from sim2real.hardware.bus.servos import PositionDrive
     from sim2real.hardware.device import Device, Reading
-    from sim2real.hardware.joint import Joint
     from sim2real.hardware.safety.gate import GateConfig, GateLimits
     from sim2real.hardware.safety.rig import Rig
 
@@ -84,16 +84,6 @@ class StsSheet(DataSheet):
     family = feetech.FAMILY
 
 
-def name_of(joint: Joint | str) -> str:
-    """Return the name of a joint."""
-    return joint if isinstance(joint, str) else joint.name
-
-
-def gear_of(joint: Joint | str) -> float:
-    """Return the turns of the servo for one of the joint; a joint that is only a name has no gear."""
-    return 1.0 if isinstance(joint, str) else joint.gear
-
-
 @dataclass(frozen=True)
 class Servos:
     """The servos on the bus, in the order of the joints.
@@ -127,19 +117,17 @@ class Servos:
     @property
     def mounting(self) -> tuple[Joint, ...]:
         """The joints."""
-        from sim2real.hardware.joint import Joint  # imported here: training needs names and gears only
-
         return tuple(Joint.of(joint) for joint in self.joints)
 
     @property
     def names(self) -> tuple[str, ...]:
         """The joints' names."""
-        return tuple(name_of(joint) for joint in self.joints)
+        return tuple(joint.name for joint in self.mounting)
 
     @property
     def gears(self) -> tuple[float, ...]:
         """Turns of each servo for one of its joint."""
-        return tuple(gear_of(joint) for joint in self.joints)
+        return tuple(joint.gear for joint in self.mounting)
 
     @property
     def at_rest(self) -> np.ndarray:

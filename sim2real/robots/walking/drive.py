@@ -143,6 +143,9 @@ class WalkingDrive(RobotDrive):
     """Encoders and the IMU's orientation and gyro; targets of all joints, with the same gains for all motors.
 
     Without motors the robot has no device, and its policy walks on the twin alone.
+
+    Attributes:
+        crouch: Offset from the stance with which a robot on its feet bends its legs ``(joints,)`` [rad].
     """
 
     centre: np.ndarray

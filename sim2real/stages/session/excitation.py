@@ -15,6 +15,7 @@ from sim2real.log.importing.readers import open_tables
 from sim2real.log.reader import read_log
 from sim2real.robots.loop import ACTUATOR, SENSOR
 from sim2real.robots.robot import Robot
+from sim2real.robots.walking.drive import WalkingDrive
 from sim2real.stages.load import mapping_of
 from sim2real.stages.session.config import RecordConfig
 from sim2real.stages.terminal.console import note
@@ -38,7 +39,7 @@ def played(config: RecordConfig, robot: Robot, announce: bool = False) -> np.nda
     """
     commands = len(robot.task.action)
     if config.standing:
-        if robot.drive.crouch is None:
+        if not isinstance(robot.drive, WalkingDrive):
             raise UsageError("this robot does not stand on legs", hint="choose another --excitation")
         return bent_legs(robot.drive.crouch, config.duration_s, robot.drive.rate_hz)
     if config.motion is None:
