@@ -12,8 +12,6 @@ from sim2real.graph.node import BaseNode
 from sim2real.worlds import friction
 from sim2real.worlds.friction import FrictionParams
 from sim2real.worlds.joint import Forces, JointState, JointWorld
-from sim2real.worlds.recorded import command_delay
-from sim2real.worlds.servo import saturated
 
 JOINTS = ("rotation", "pitch", "elbow", "wrist_pitch", "wrist_roll", "jaw")
 
@@ -112,23 +110,12 @@ class ArmWorld(JointWorld):
         del rng, graph_state
         return nominal()
 
-    def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> JointState:
-        params = (graph_state or GraphState()).params.get(self.name) or self.init_params(rng)
-        return JointState(params.start[:6], params.start[6:])
-
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> JointState:
-        return (graph_state or GraphState()).state.get(self.name) or self.init_state(rng, graph_state)
-
-    def init_delays(self, rng: Any = None, graph_state: GraphState | None = None) -> dict[str, Any]:
-        del rng
-        return command_delay(graph_state)
-
     def command(self, step_state: StepState) -> Any:
         return step_state.inputs["actuator"][-1].data.goal
 
     def forces(self, params: ArmParams, position: Any, velocity: Any, command: Any) -> Forces:
         p = params
-        error = saturated(command + p.bias - position, p.saturation) + _weight(p, position)
+        error = jnp.clip(command + p.bias - position, -p.saturation, p.saturation) + _weight(p, position)
         return Forces(
             acceleration=p.stiffness * error,
             damping=p.damping,

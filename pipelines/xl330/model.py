@@ -12,7 +12,6 @@ import jax.numpy as jnp
 from sim2real import pytree
 from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.worlds.joint import Forces, JointWorld
-from sim2real.worlds.servo import motor_torque, position_duty
 
 MASS_KG, LENGTH_M, GRAVITY = 0.49, 0.10, 9.81
 COUNTS_PER_RAD, FULL_PWM, KP_UNIT = 4096 / (2 * jnp.pi), 885.0, 256.0
@@ -73,6 +72,33 @@ class ServoParams(Base):
     released: Any = 0.5
     offset: Any = 0.0
     start: Any = pytree.field(default_factory=lambda: jnp.zeros(2))
+
+
+def position_duty(goal: Any, position: Any, gain: Any, counts_per_unit: float, full: float) -> Any:
+    """Return the duty, in [-1, 1], of a position loop that works on integers, like that of DYNAMIXEL's firmware.
+
+    Args:
+        goal: Goal position [rad].
+        position: Present position [rad].
+        gain: PWM steps per count of error.
+        counts_per_unit: Encoder counts per radian.
+    """
+    off = jnp.floor(goal * counts_per_unit + 0.5) - jnp.floor(position * counts_per_unit + 0.5)
+    return jnp.trunc(jnp.clip(gain * off, -full, full)) / full
+
+
+def motor_torque(duty: Any, velocity: Any, stall: Any, back_emf: Any, softness: Any = 0.0) -> Any:
+    """Return the torque of a motor under a duty [N m].
+
+    Args:
+        duty: In [-1, 1].
+        velocity: [rad/s].
+        stall: Torque at full duty and standstill, without saturation [N m].
+        back_emf: Torque lost to back-EMF per speed [N m s/rad].
+        softness: Saturation: the torque stays below ``1 / softness`` [1/(N m)].
+    """
+    linear = stall * duty - back_emf * velocity
+    return linear / (1.0 + softness * jnp.abs(linear))
 
 
 class ServoWorld(JointWorld):

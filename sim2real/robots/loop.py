@@ -9,12 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sim2real import pytree
-from sim2real.graph.base import Base, GraphState
 from sim2real.graph.delays import TrainableDist
 from sim2real.graph.node import BaseNode, Scheduling
 from sim2real.identification.parameters import Parameter
-from sim2real.types import PyTree, Scalar
+from sim2real.types import PyTree
 
 if TYPE_CHECKING:
     import jax
@@ -35,33 +33,6 @@ DELAY_SPREAD_S = 0.002
 """Largest deviation, up or down, of an episode's delay from that of the simulated loop [s]."""
 EMPTY: Mapping[str, np.ndarray] = MappingProxyType({})
 """No samples."""
-
-
-@pytree.dataclass
-class DelayParams(Base):
-    """Parameters of a simulated sensor or actuator.
-
-    Attributes:
-        delay: Delay of its connection with the world [s]; None: as the connection was made.
-        noise: Factor on deviation and bias of a sensor's noise; None: 1.
-    """
-
-    delay: Scalar | None = None
-    noise: Scalar | None = None
-
-
-def delay_of(node: str, input_name: str, graph_state: GraphState | None) -> dict[str, PyTree]:
-    """Return the result of ``init_delays``: the delay in a node's ``DelayParams``, if it has one.
-
-    Args:
-        input_name: The input that it belongs to.
-        graph_state: The graph's state, with the parameters; None: no delay.
-
-    Returns:
-        Input name -> delay [s], or empty.
-    """
-    delay = getattr((graph_state or GraphState()).params.get(node), "delay", None)
-    return {} if delay is None else {input_name: delay}
 
 
 def delay_parameters(max_delay_s: float) -> list[Parameter]:

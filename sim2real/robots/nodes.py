@@ -21,9 +21,10 @@ from sim2real.graph.node import BaseNode, NodeOptions
 from sim2real.later import jax, jnp
 from sim2real.policy.runner import Runner
 from sim2real.robots.agent import AgentParams, PolicyAgent
-from sim2real.robots.loop import ACTUATOR, AGENT, SENSOR, DelayParams, control_nodes, delay_of
+from sim2real.robots.loop import ACTUATOR, AGENT, SENSOR, control_nodes
 from sim2real.robots.messages import Decision, Goals
 from sim2real.types import Array, Key, PyTree
+from sim2real.worlds.recorded import DelayParams, delay_of
 
 if TYPE_CHECKING:
     from sim2real.hardware.device import Reading

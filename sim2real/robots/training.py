@@ -25,7 +25,6 @@ from sim2real.robots.loop import (
     DELAYS,
     SENSOR,
     WORLD,
-    DelayParams,
     delay_bounds,
     delay_parameters,
     recorded_loop,
@@ -37,6 +36,7 @@ from sim2real.robots.messages import EpisodeStart
 from sim2real.robots.nodes import SimActuator, SimSensor
 from sim2real.training.environment.tasks import Rewards, TrainingTask
 from sim2real.types import Array, PyTree, Scalar
+from sim2real.worlds.recorded import DelayParams
 
 if TYPE_CHECKING:
     from sim2real.robots.robot import Robot

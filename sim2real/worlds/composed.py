@@ -18,7 +18,7 @@ from sim2real.composer.variation.variators import CONSTANTS
 from sim2real.errors import UsageError
 from sim2real.graph.base import Base, GraphState, StepState, Value
 from sim2real.graph.node import BaseWorld
-from sim2real.worlds.recorded import command_delay
+from sim2real.worlds.recorded import delay_of
 
 if TYPE_CHECKING:
     from mujoco import mjx
@@ -132,7 +132,7 @@ class ComposedWorld(BaseWorld):
     def init_delays(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> dict[str, Value]:
         """Return the delay of commands in an episode [s]: `delay` in the parameters of their sender."""
         del rng
-        return command_delay(graph_state, self.input_name)
+        return delay_of(self.input_name, self.input_name, graph_state)
 
     def output(self, state: State) -> PyTree:
         """Return the message of a state; default: the task's observation."""

@@ -15,7 +15,7 @@ from sim2real.types import MjModel, PyTree, Scalar
 from sim2real.worlds.closing import Closing
 from sim2real.worlds.drive_terms import DriveLaw, DriveTerms
 from sim2real.worlds.mjx import MjxParams, MjxWorld
-from sim2real.worlds.recorded import command_delay
+from sim2real.worlds.recorded import delay_of
 
 if TYPE_CHECKING:
     from sim2real.graph.base import Value
@@ -174,7 +174,8 @@ class DrivenWorld(MjxWorld):
         MuJoCo's integrator moves a joint as if a force had acted half a time step earlier: this half step is added.
         """
         del rng
-        return {name: delay + self.lead_s for name, delay in command_delay(graph_state, self.input_name).items()}
+        delays = delay_of(self.input_name, self.input_name, graph_state)
+        return {name: delay + self.lead_s for name, delay in delays.items()}
 
     def _control(self, step_state: StepState) -> jax.Array:
         """Return forces, stiffnesses and dampings, ``(3 * joints,)``, for the newest command.

@@ -14,7 +14,7 @@ from sim2real.graph.node import BaseWorld
 from sim2real.later import jax, jnp
 from sim2real.types import PyTree
 from sim2real.worlds.friction import rubbed
-from sim2real.worlds.recorded import command_delay
+from sim2real.worlds.recorded import delay_of
 
 if TYPE_CHECKING:
     from sim2real.graph.base import Value
@@ -98,7 +98,7 @@ class JointWorld(BaseWorld):
     def init_delays(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> dict[str, Value]:
         """Return the delay of the commands, where the actuator's parameters set one."""
         del rng
-        return command_delay(graph_state)
+        return delay_of("actuator", "actuator", graph_state)
 
     def step(self, step_state: StepState) -> tuple[StepState, PyTree]:
         """Integrate over one tick."""

@@ -9,7 +9,7 @@ from sim2real import pytree
 from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.node import BaseNode
 from sim2real.later import jax, jnp
-from sim2real.types import PyTree
+from sim2real.types import PyTree, Scalar
 
 if TYPE_CHECKING:
     from sim2real.graph.base import Value
@@ -49,14 +49,22 @@ class Encoder(Base):
 
 
 @pytree.dataclass
-class CommandDelay(Base):
-    """Parameters of a recorded actuator.
+class DelayParams(Base):
+    """Parameters of a sensor or an actuator, simulated or recorded.
 
     Attributes:
-        delay: Delay from a command's time stamp to its effect [s]; None: that of the connection.
+        delay: Delay of its connection with the world [s]; None: as the connection was made.
+        noise: Factor on deviation and bias of a sensor's noise; None: 1.
     """
 
-    delay: Value | None = None
+    delay: Scalar | None = None
+    noise: Scalar | None = None
+
+
+def delay_of(node: str, input_name: str, graph_state: GraphState | None) -> dict[str, PyTree]:
+    """Return what ``init_delays`` returns: input name -> the delay in a node's parameters [s], if they have one."""
+    delay = getattr((graph_state or GraphState()).params.get(node), "delay", None)
+    return {} if delay is None else {input_name: delay}
 
 
 class RecordedActuator(BaseNode):
@@ -71,10 +79,10 @@ class RecordedActuator(BaseNode):
         super().__init__(name, rate)
         self._message = message
 
-    def init_params(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> CommandDelay:
+    def init_params(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> DelayParams:
         """Return parameters without a delay."""
         del rng, graph_state
-        return CommandDelay()
+        return DelayParams()
 
     def init_output(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> PyTree:
         """Return the command that the node was made with."""
@@ -109,9 +117,3 @@ class RecordedSensor(BaseNode):
         """Read."""
         position = step_state.inputs["world"][-1].data.position
         return step_state, self._message(step_state.params.read(position) if self._encoder else position)
-
-
-def command_delay(graph_state: GraphState | None, actuator: str = "actuator") -> dict[str, Value]:
-    """Return what a world's ``init_delays`` returns: the actuator's delay [s], if its parameters have one."""
-    delay = getattr((graph_state or GraphState()).params.get(actuator), "delay", None)
-    return {} if delay is None else {actuator: delay}

@@ -15,8 +15,8 @@ from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph import Base, BaseNode
 from sim2real.graph.base import GraphState
 from sim2real.graph.schedule import draw
-from sim2real.robots.loop import DelayParams
 from sim2real.runtime.compiled.graph import CompiledGraph
+from sim2real.worlds.recorded import DelayParams
 
 CART = """
 <mujoco model="cart"><option timestep="0.01"/>

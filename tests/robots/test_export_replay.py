@@ -24,7 +24,7 @@ from sim2real.identification.segments import Span
 from sim2real.robots.identified import LoggedRobot
 from sim2real.robots.robot import Exported
 from sim2real.worlds.mjx import MjxWorld
-from sim2real.worlds.recorded import RecordedActuator, command_delay
+from sim2real.worlds.recorded import RecordedActuator, delay_of
 
 STEP_S, SEGMENT_S = 0.002, 1.2
 XML = f"""
@@ -54,7 +54,7 @@ class Angle(Base):
 
 class Drive(MjxWorld):
     def init_delays(self, rng=None, graph_state=None):
-        return command_delay(graph_state)
+        return delay_of("actuator", "actuator", graph_state)
 
 
 class Reader(BaseNode):

@@ -14,10 +14,8 @@ from sim2real.identification.parameters import ParameterTable
 from sim2real.robots.loop import (
     BURST,
     DELAYS,
-    DelayParams,
     control_nodes,
     delay_bounds,
-    delay_of,
     delay_parameters,
     recorded_loop,
     simulated_loop,
@@ -25,6 +23,7 @@ from sim2real.robots.loop import (
     split_drawn_delay,
 )
 from sim2real.robots.training import draw_values
+from sim2real.worlds.recorded import DelayParams, delay_of
 
 TICK_S, SPREAD_S, LEAD_S = 0.01, 0.002, 0.00125
 VALUES = {"gain": 2.0, "damping": 0.3, "friction": 0.1, "sensor_delay": 0.013, "actuator_delay": 0.001}

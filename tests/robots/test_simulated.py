@@ -13,10 +13,10 @@ from sim2real.artifacts.identification import Noise
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, InputState, StepState
 from sim2real.robots.agent import AgentParams
-from sim2real.robots.loop import DelayParams
 from sim2real.robots.messages import Decision, JointReading
 from sim2real.robots.nodes import SimActuator, SimSensor
 from sim2real.robots.servo.world import ServoState
+from sim2real.worlds.recorded import DelayParams
 
 
 def heard(sender, message):

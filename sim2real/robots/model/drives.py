@@ -17,12 +17,12 @@ from sim2real.errors import UsageError
 from sim2real.graph.base import Base, GraphState, StepState, Value
 from sim2real.graph.node import BaseNode
 from sim2real.identification.model import PlainSimulation, converged
-from sim2real.robots.loop import delay_of
 from sim2real.robots.model.file import one_line, read_spec
 from sim2real.robots.model.held import Holding, apply, plan
 from sim2real.types import Array, Json, Key, MjModel, MjSpec, PyTree, Scalar
 from sim2real.worlds.drive_terms import NO_LIMIT, DriveTerms
 from sim2real.worlds.driven import PAYLOAD, DrivenWorld, DriveParams, payload_place
+from sim2real.worlds.recorded import delay_of
 
 mj: Any = mujoco
 

@@ -14,9 +14,10 @@ from sim2real.composer.physics.mjx import constants, gate, stepping
 from sim2real.composer.physics.mjx.import_mjx import mjx
 from sim2real.graph.base import Base, Empty, GraphState, StepState, Value
 from sim2real.graph.node import BaseWorld
-from sim2real.robots.loop import ACTUATOR, WORLD, delay_of
+from sim2real.robots.loop import ACTUATOR, WORLD
 from sim2real.robots.messages import JointReading
 from sim2real.types import MjModel, PyTree
+from sim2real.worlds.recorded import delay_of
 from sim2real.worlds.rollouts import Start, WornFriction
 
 if TYPE_CHECKING:

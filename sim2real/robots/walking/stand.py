@@ -15,7 +15,7 @@ from sim2real.errors import OtherMotion
 from sim2real.graph.episode import Episode
 from sim2real.graph.node import BaseNode
 from sim2real.identification.parameters import ParameterTable
-from sim2real.robots.loop import ACTUATOR, SENSOR, WORLD, DelayParams, delay_parameters, recorded_loop
+from sim2real.robots.loop import ACTUATOR, SENSOR, WORLD, delay_parameters, recorded_loop
 from sim2real.robots.model.drives import EncoderParams, Encoders, driven_spec
 from sim2real.robots.model.file import read_spec
 from sim2real.robots.walking.drive import gravity_of
@@ -23,7 +23,7 @@ from sim2real.robots.walking.world import MOTOR_STRENGTH, STRENGTH
 from sim2real.types import Array, MjModel, PyTree, Scalar
 from sim2real.worlds.driven import DriveCommand, DrivenWorld
 from sim2real.worlds.mjx import MjxState
-from sim2real.worlds.recorded import RecordedActuator
+from sim2real.worlds.recorded import DelayParams, RecordedActuator
 
 if TYPE_CHECKING:
     from sim2real.robots.walking.robot import ComposedRobot

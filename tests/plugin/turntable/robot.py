@@ -14,7 +14,6 @@ from sim2real.identification.model import Channel
 from sim2real.identification.parameters import Parameter
 from sim2real.policy.contract import ActionTerm, ObservationTerm
 from sim2real.robots.agent import GoalAgent
-from sim2real.robots.loop import delay_of
 from sim2real.robots.messages import EpisodeStart, Goals, JointReading
 from sim2real.robots.robot import Embedded, Judgement, Robot, RobotDrive, RobotModel, RobotTask
 from sim2real.worlds.joint import Forces, JointState, JointWorld
@@ -49,14 +48,6 @@ class Table(JointWorld):
         """Return the start that the parameters name."""
         params = (graph_state or GraphState()).params.get(self.name) or self.init_params()
         return JointState(params.start[:1], params.start[1:])
-
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> JointState:
-        """Return the state at the start."""
-        return self.init_state(rng, graph_state)
-
-    def init_delays(self, rng: Any = None, graph_state: GraphState | None = None) -> dict[str, Any]:
-        """Return the delay of the command, where the actuator's parameters set one."""
-        return delay_of("actuator", "actuator", graph_state)
 
     def command(self, step_state: Any) -> Any:
         """Return the commanded speed [rad/s]."""

@@ -1,15 +1,17 @@
-"""What servos make of commands, against integers and floats by hand."""
+"""What an XL330 makes of commands, against integers and floats by hand."""
 
 import math
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim2real.worlds.servo import motor_torque, position_duty, saturated
+from sim2real.stages.load import load_module
+
+MODEL = load_module("xl330", "model")
+motor_torque, position_duty = MODEL.motor_torque, MODEL.position_duty
 
 COUNTS = 4096 / (2 * math.pi)
 FULL = 885
@@ -25,11 +27,6 @@ def duty_by_hand(goal_counts, position_counts, kp):
 def test_position_duty_is_what_the_firmware_computes_in_integers(goal, position, kp):
     found = position_duty(jnp.float32(goal / COUNTS), jnp.float32(position / COUNTS), kp / 256, COUNTS, float(FULL))
     assert float(found) == pytest.approx(duty_by_hand(goal, position, kp), abs=1e-6)
-
-
-def test_an_error_saturates_either_way():
-    errors = jnp.array([-2.0, -0.3, 0.0, 0.2, 0.31])
-    np.testing.assert_allclose(saturated(errors, 0.3), [-0.3, -0.3, 0.0, 0.2, 0.3])
 
 
 duties, velocities = st.floats(-1.0, 1.0), st.floats(-20.0, 20.0)
