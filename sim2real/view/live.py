@@ -16,7 +16,7 @@ import numpy as np
 
 from sim2real.graph.episode import TICKS_PER_S, Episode, Steps
 from sim2real.log.reader import LogTail
-from sim2real.view.rerun_content import Curve, Tab, episode_tab, with_goals
+from sim2real.view.rerun_content import LATENESS, Curve, Tab, episode_tab, with_goals
 from sim2real.view.rerun_recording import Scene, blueprint_of, send_style, send_values, time_column
 from sim2real.view.signals import outputs_of
 
@@ -139,13 +139,13 @@ class LogSource:
             return None
         thinned, lateness = _thinned(episode)
         tab = episode_tab(self._entity, self._entity, outputs_of(thinned), [])
-        # The lateness of all steps goes into the last plot, and no schedule is drawn: it needs every step.
+        # Of each group of steps the latest one goes into the last plot.
         curves = [
             Curve(f"{self._entity}/lateness/{node}", node, "", steps.woken / TICKS_PER_S, lateness[node])
             for node, steps in thinned.steps.items()
         ]
         return _moved(
-            replace(tab, plots={**with_goals(tab.plots), "Lateness [ms]": curves}, episode=None, recent_s=RECENT_S),
+            replace(tab, plots={**with_goals(tab.plots), LATENESS: curves}, recent_s=RECENT_S),
             self._offset_s(self._tail.epoch_ns),
         )
 

@@ -9,11 +9,12 @@ import numpy as np
 from sim2real.artifacts.deployment import Deployment
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run import StageFolder
-from sim2real.graph.episode import TICKS_PER_S, Episode, Steps
+from sim2real.graph.episode import TICKS_PER_S
 from sim2real.log.schema import unit_of
+from sim2real.log.session import is_imported
 from sim2real.view.signals import Series, Signals, signals_of, simulated_beside
 
-IDLE = "idle"
+LATENESS = "Lateness [ms]"
 _MOST_PLOTS = 28
 """More plots beside each other cannot be read: a quadruped's log has 91."""
 
@@ -55,16 +56,13 @@ class Tab:
         entity: Prefix of all its entities.
         plots: Title -> curves, from top to bottom.
         motions: Motions in the 3-D view.
-        episode: Source of the schedule; None without a schedule.
-        recent_s: Part before the time cursor that the plots of a live view show [s], infinite for all of it; None: the
-            tab is not live.
+        recent_s: Part before the time cursor that the plots of a live view show [s]; None: the tab is not live.
     """
 
     title: str
     entity: str
     plots: Mapping[str, list[Curve]]
     motions: list[SceneMotion]
-    episode: Episode | None = None
     recent_s: float | None = None
 
 
@@ -92,7 +90,7 @@ def _dry(title: str, log: Signals) -> str:
 
 
 def episode_tab(title: str, entity: str, log: Signals, simulated: list[Series]) -> Tab:
-    """Return the tab of a log: measured, true and simulated states, what nodes command, and the schedule."""
+    """Return the tab of a log: measured, true and simulated states, what nodes command, and their lateness."""
     plots: dict[str, list[Curve]] = {}
     models = {s.name: s for s in simulated}
     for series in log.measured:
@@ -114,7 +112,14 @@ def episode_tab(title: str, entity: str, log: Signals, simulated: list[Series]) 
     if simulated:
         states = [s for s in simulated if s.name not in commands]
         motions.append(_motion(f"{entity}/scene/simulation", states, [], ghost=True))
-    return Tab(title, entity, plots, motions, log.episode)
+    if not is_imported(log.episode):
+        steps = log.episode.steps.items()
+        plots[LATENESS] = [
+            Curve(f"{entity}/lateness/{n}", n, "", every.woken / TICKS_PER_S, (every.woken - every.start) / 1e3)
+            for n, every in steps
+            if len(every)
+        ]
+    return Tab(title, entity, plots, motions)
 
 
 def with_goals(plots: Mapping[str, list[Curve]]) -> dict[str, list[Curve]]:
@@ -133,20 +138,6 @@ def readable(plots: Mapping[str, list[Curve]]) -> dict[str, list[Curve]]:
         return dict(plots)
     moving = {t: c for t, c in with_goals(plots).items() if any(len(x.values) and np.ptp(x.values) for x in c)}
     return moving or dict(plots)
-
-
-def states_of(steps: Steps) -> tuple[np.ndarray, list[str]]:
-    """Return the times of a node's changes of state [s], and the new states: waiting, late, computing, idle.
-
-    States without duration are skipped.
-    """
-    due = steps.scheduled + steps.drift
-    times = np.stack([np.minimum(due, steps.start), steps.start, steps.woken, steps.end], axis=1).ravel()
-    names = ["waiting", "late", "computing", IDLE] * len(steps)
-    # After an overrun a step is due before the previous one ends; it waits only from that end on.
-    times = np.maximum.accumulate(times)
-    lasting = np.append(np.diff(times) > 0, True)
-    return times[lasting] / TICKS_PER_S, [name for name, lasts in zip(names, lasting, strict=True) if lasts]
 
 
 def _curve(folder: str, series: Series, look: str, label: str) -> Curve:

@@ -1,9 +1,8 @@
-"""A run as a Rerun recording: signals, schedule and a 3-D scene on one timeline.
+"""A run as a Rerun recording: signals, lateness and a 3-D scene on one timeline.
 
 The data is sent after the run, so that no control loop waits for a viewer, and by columns, which is 17 times faster.
 """
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,10 +11,8 @@ import numpy as np
 
 from sim2real.artifacts.run import finished_stages, pipeline_of
 from sim2real.errors import Sim2RealError
-from sim2real.graph.episode import TICKS_PER_S, Episode
-from sim2real.view.rerun_content import IDLE, Curve, Tab, readable, states_of, tabs_of
+from sim2real.view.rerun_content import Curve, Tab, readable, tabs_of
 from sim2real.view.rerun_viewer import open_viewer, rerun_module
-from sim2real.view.timing import color_of, in_order, slowest_period_s
 
 TIMELINE = "time"
 """The only timeline, so that the viewer has no choice of another one."""
@@ -34,11 +31,8 @@ _COLORS = {
     "command": (190, 112, 192),
 }  # fmt: skip
 _WIDTHS = {"measured": 2.0, "identified": 1.6, "truth": 1.2, "command": 1.6}
-_STATES = {"waiting": (110, 120, 132), "late": (226, 138, 48), "computing": (66, 150, 230)}
 _ROWS = 7
 """Largest number of plots below each other."""
-_PERIODS = 1.5
-"""Visible part of the schedule on either side of the time cursor [periods of the slowest node]."""
 
 
 def view(
@@ -81,8 +75,6 @@ def build(recording: Any, tabs: Sequence[Tab], name: str, scene: Scene | None = 
     for tab in tabs:
         for curve in (c for curves in tab.plots.values() for c in curves):
             send_curve(recording, curve)
-        if tab.episode is not None:
-            _send_timing(recording, tab.entity, tab.episode)
         for motion in tab.motions if scene else ():
             if scene and len(motion.t_s):
                 scene(recording, motion.t_s, motion.columns, motion.entity, motion.ghost)
@@ -113,39 +105,6 @@ def send_values(recording: Any, curve: Curve, time: Any) -> None:
     recording.send_columns(curve.entity, [time], rerun_module().Scalars.columns(scalars=curve.values))
 
 
-def _send_timing(recording: Any, folder: str, episode: Episode) -> None:
-    """Send each node's states as lanes, and its lateness as a curve; the page has the ages of inputs in a table."""
-    rr = rerun_module()
-    for node in in_order(episode):
-        steps = episode.steps[node]
-        if not len(steps):
-            continue
-        lane = f"{folder}/schedule/{node}"
-        # Send an invisible idle state: the viewer accepts null, but Rerun's `rrd verify` rejects it.
-        color = _own_color(episode, node)
-        looks = {**_STATES, **({"computing": color} if color else {})}
-        named = rr.StateConfiguration(
-            values=[*_STATES, IDLE],
-            labels=[*_STATES, IDLE],
-            colors=[*looks.values(), (0, 0, 0)],
-            visible=[*(True for _ in _STATES), False],
-        )
-        recording.log(lane, named, static=True)
-        times, states = states_of(steps)
-        recording.send_columns(lane, [time_column(times)], rr.StateChange.columns(state=states))
-        lateness = f"{folder}/lateness/{node}"
-        recording.log(lateness, rr.SeriesLines(names=node, widths=1.2, colors=color), static=True)
-        late_ms = (steps.woken - steps.start) / 1e3
-        times = time_column(steps.woken / TICKS_PER_S)
-        recording.send_columns(lateness, [times], rr.Scalars.columns(scalars=late_ms))
-
-
-def _own_color(episode: Episode, node: str) -> tuple[int, int, int] | None:
-    """Return a node's configured colour, if any."""
-    color = color_of(episode, node, "")
-    return (int(color[1:3], 16), int(color[3:5], 16), int(color[5:7], 16)) if color else None
-
-
 def blueprint_of(tabs: Sequence[Tab], with_scene: bool) -> Any:
     """Return the arrangement of the tabs; of live ones the newest is open."""
     import rerun.blueprint as rrb
@@ -166,7 +125,7 @@ def blueprint_of(tabs: Sequence[Tab], with_scene: bool) -> Any:
 
 
 def _page(tab: Tab, with_scene: bool) -> Any:
-    """Return a tab's arrangement: plots on the left; scene, schedule and lateness on the right."""
+    """Return a tab's arrangement: plots on the left, the scene on the right."""
     import rerun.blueprint as rrb
 
     legend = rrb.PlotLegend(corner=rrb.Corner2D.RightTop)
@@ -174,8 +133,6 @@ def _page(tab: Tab, with_scene: bool) -> Any:
         # The timeline is as long as the longest episode; each tab shows its own.
         last = max(float(c.t_s[-1]) for curves in tab.plots.values() for c in curves if len(c.t_s))
         begin, end = (rrb.TimeRangeBoundary.absolute(seconds=t_s) for t_s in (0.0, last))
-    elif math.isinf(tab.recent_s):
-        begin, end = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.infinite()
     else:
         begin, end = (rrb.TimeRangeBoundary.cursor_relative(seconds=t_s) for t_s in (-tab.recent_s, 0.0))
     whole = rrb.TimeAxis(view_range=rrb.TimeRange(start=begin, end=end))
@@ -183,32 +140,15 @@ def _page(tab: Tab, with_scene: bool) -> Any:
         rrb.TimeSeriesView(name=title, contents=[c.entity for c in curves], plot_legend=legend, axis_x=whole)
         for title, curves in readable(tab.plots).items()
     ]
-    side: list[Any] = []
-    if with_scene and tab.motions:
-        side.append(rrb.Spatial3DView(name="Robot", origin=f"/{tab.entity}/scene"))
-    if tab.episode is not None:
-        around_s = _PERIODS * slowest_period_s(tab.episode)
-        near = rrb.TimeRange(
-            start=rrb.TimeRangeBoundary.cursor_relative(seconds=-around_s),
-            end=rrb.TimeRangeBoundary.cursor_relative(seconds=around_s),
-        )
-        side += [
-            rrb.StateTimelineView(
-                name="Schedule", origin=f"/{tab.entity}/schedule", time_view=rrb.TimeAxis(view_range=near)
-            ),
-            rrb.TimeSeriesView(
-                name="Lateness [ms]", origin=f"/{tab.entity}/lateness", plot_legend=legend, axis_x=whole
-            ),
-        ]
     # Many plots, such as those of several joints, stand in columns.
     columns = -(-len(plots) // _ROWS)
     left = (
         rrb.Grid(*plots, grid_columns=columns, name=tab.title) if columns > 1 else rrb.Vertical(*plots, name=tab.title)
     )
-    if not side:
+    if not (with_scene and tab.motions):
         return left
-    shares = [3, *([2, 2] if len(side) > 1 else [])][-len(side) :] if with_scene else None
-    return rrb.Horizontal(left, rrb.Vertical(*side, row_shares=shares), column_shares=[3, 2], name=tab.title)
+    scene = rrb.Spatial3DView(name="Robot", origin=f"/{tab.entity}/scene")
+    return rrb.Horizontal(left, scene, column_shares=[3, 2], name=tab.title)
 
 
 def time_column(t_s: np.ndarray) -> Any:

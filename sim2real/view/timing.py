@@ -1,7 +1,6 @@
 """Timing of a log on a page: the schedule as a figure, a row of numbers for each node, and the parts of the delay."""
 
 import math
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import astuple, replace
 from itertools import pairwise
@@ -9,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import is_color_like, to_hex
 from matplotlib.patches import Patch
 
 from sim2real.artifacts.identification import ROUND_TRIP, Identification
@@ -72,7 +70,8 @@ def timing_blocks(episode: Episode, name: str, which: str = "", folded: bool = F
 def schedule(episode: Episode, name: str) -> str:
     """Draw when nodes computed and waited: in real time around the latest wake-up, in virtual time in the middle."""
     nodes = [n for n in in_order(episode) if len(episode.steps[n])]
-    length = _PERIODS_SHOWN * 1e6 * slowest_period_s(episode)
+    periods = [float(np.median(np.diff(s.start))) for s in episode.steps.values() if len(s) > 1]
+    length = _PERIODS_SHOWN * max(periods, default=1e6 * episode.duration_s)
     late = {n: episode.steps[n].woken - episode.steps[n].start for n in nodes}
     worst = max(nodes, key=lambda n: late[n].max())
     title = f"Around the latest wake-up: {worst}, {late[worst].max() / 1e3:.1f} ms"
@@ -84,16 +83,15 @@ def schedule(episode: Episode, name: str) -> str:
         figure = new_figure(0.9 + 0.4 * len(nodes), style.PHONE_IN)
         axes = figure.subplots()
         for row, node in enumerate(nodes):
-            _bars(axes, episode.steps[node], row, begin, begin + length, color_of(episode, node, BLUE))
+            _bars(axes, episode.steps[node], row, begin, begin + length)
         _messages(axes, episode, nodes, begin, begin + length)
         axes.set(title=title, xlabel=f"time since {begin / 1e6:.3f} s [ms]", xlim=(0, length / 1e3))
         axes.set_yticks(range(len(nodes)), nodes)
         axes.grid(False, axis="y")
         axes.tick_params(axis="y", length=0)
         axes.set_ylim(len(nodes) - 0.5, -0.6)
-        own_colors = any(color_of(episode, n, BLUE) != BLUE for n in nodes)
         entries = [
-            Patch(facecolor=BLUE, label="computing, or in the node's own colour" if own_colors else "computing"),
+            Patch(facecolor=BLUE, label="computing"),
             Patch(facecolor=ORANGE, label="late wake-up"),
             Patch(facecolor="none", edgecolor=MUTED, hatch="////", label="waiting for its inputs"),
         ]
@@ -101,8 +99,8 @@ def schedule(episode: Episode, name: str) -> str:
         return to_svg(figure, name, "An excerpt of the schedule: when each node waited and computed, and its messages")
 
 
-def _bars(axes: Axes, steps: Steps, row: int, begin: float, end: float, color: str) -> None:
-    """Draw the steps of one node that overlap an interval [us]; computation is drawn in ``color``."""
+def _bars(axes: Axes, steps: Steps, row: int, begin: float, end: float) -> None:
+    """Draw the steps of one node that overlap an interval [us]."""
     # Draw the waiting from the previous step's end on, as after an overrun a step is due before it.
     free = np.concatenate([[0], steps.end[:-1]])
     due_at = np.minimum(np.maximum(steps.scheduled + steps.drift, free), steps.start)
@@ -111,7 +109,7 @@ def _bars(axes: Axes, steps: Steps, row: int, begin: float, end: float, color: s
     kinds: tuple[tuple[np.ndarray, np.ndarray, dict[str, Any]], ...] = (
         (due, start, {"facecolor": "none", "edgecolor": MUTED, "hatch": "////", "lw": 0.6}),
         (start, woken, {"facecolor": ORANGE}),
-        (woken, done, {"facecolor": color, "edgecolor": color, "lw": 0.8}),  # edge: keeps short steps visible
+        (woken, done, {"facecolor": BLUE, "edgecolor": BLUE, "lw": 0.8}),  # edge: keeps short steps visible
     )
     for first, last, look in kinds:
         wide = last > first
@@ -196,21 +194,3 @@ def in_order(episode: Episode) -> list[str]:
     orders = {n: node.get("order") for n, node in episode.metadata.get("graph", {}).items()}
     place = {n: orders[n] if isinstance(orders.get(n), int) else math.inf for n in order}
     return sorted(order, key=lambda n: place[n])  # a stable sort
-
-
-def color_of(episode: Episode, node: str, default: str) -> str:
-    """Return a node's colour as ``#rrggbb``.
-
-    Args:
-        default: Returned if the node has no valid colour.
-    """
-    color = episode.metadata.get("graph", {}).get(node, {}).get("color")
-    if not isinstance(color, str) or re.fullmatch("#[0-9a-f]{6}", color):
-        return color or default
-    return to_hex(color) if is_color_like(color) else default
-
-
-def slowest_period_s(episode: Episode) -> float:
-    """Return the longest of the nodes' median periods [s]."""
-    periods = [float(np.median(np.diff(s.start))) for s in episode.steps.values() if len(s) > 1]
-    return max(periods, default=1e6 * episode.duration_s) / 1e6

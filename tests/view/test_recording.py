@@ -19,10 +19,9 @@ from installed import need
 
 from sim2real.artifacts.run import finished_stages
 from sim2real.errors import Sim2RealError
-from sim2real.graph.episode import StepRecord, steps_from_records
 from sim2real.stages.live import drawn, scene_of
 from sim2real.stages.load import load_robot
-from sim2real.view.rerun_content import states_of, tabs_of
+from sim2real.view.rerun_content import tabs_of
 from sim2real.view.rerun_recording import _COLORS, view
 
 RERUN = Path(sysconfig.get_path("scripts")) / "rerun"
@@ -65,7 +64,6 @@ def test_every_curve_stands_on_the_one_timeline(saved, finished_run):
             assert rows[f"/{curve.entity}"] == len(curve.t_s), curve.entity
     for folder in ("record", "deploy/0", "deploy/1"):
         assert rows[f"/{folder}/lateness/agent"] == synthetic_run.STEPS
-        assert rows[f"/{folder}/schedule/agent"] >= 3 * synthetic_run.STEPS
         assert rows[f"/{folder}/scene/robot/body_1"] == synthetic_run.STEPS
     assert rows["/deploy/0/scene/simulation/body_1"] == 400
 
@@ -98,20 +96,6 @@ def test_plots_bring_together_who_speaks_of_the_same(finished_run):
     assert labels["action [V]"] == ["sent by actuator", "simulation"]
     command = tabs["Deploy 1"].plots["action [V]"][1]
     assert command.t_s[0] == pytest.approx(0.013), "the times that the simulation gave"
-
-
-def test_states_follow_each_other_from_due_to_end():
-    records = [
-        StepRecord("n", 0, 0, 0, 100, -1, 30_000, 0),
-        StepRecord("n", 1, 20_000, 30_000, 30_000, -1, 31_000, 0),
-        StepRecord("n", 2, 40_000, 45_000, 45_200, -1, 46_000, 0),
-    ]
-    times, states = states_of(steps_from_records(records))
-    assert list(zip((1e3 * times).round(3).tolist(), states, strict=True)) == [
-        (0.0, "late"), (0.1, "computing"),
-        (30.0, "computing"), (31.0, "idle"),
-        (40.0, "waiting"), (45.0, "late"), (45.2, "computing"), (46.0, "idle"),
-    ]  # fmt: skip
 
 
 def test_the_pendulum_points_where_the_angle_says(saved):
