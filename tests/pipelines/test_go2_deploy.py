@@ -98,7 +98,7 @@ def test_a_recording_moves_the_legs_in_a_stand(tmp_path):
 @pytest.mark.night
 def test_a_run_records_identifies_and_deploys_the_shipped_policy(tmp_path, capsys):
     """The smaller tests are those of the model in a stand, of the run's stages, and of the deployment above."""
-    (command,) = re.findall(r"^    sim2real (run go2.*)$", GUIDE.read_text(), re.MULTILINE)
+    (command,) = re.findall(r"`sim2real (run go2[^`]*)`", GUIDE.read_text())
     assert cli.main([*shlex.split(command), "--runs", str(tmp_path)]) == 0
     output = capsys.readouterr()
     assert "ships a policy, and JAX has no GPU" in output.err

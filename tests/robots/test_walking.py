@@ -105,7 +105,7 @@ def test_a_copy_of_the_pipeline_under_another_name_is_a_robot(tmp_path, monkeypa
 @pytest.mark.night
 def test_the_commands_of_the_guide_run(tmp_path, monkeypatch):
     text = (ROOT / "docs/guides/walk.md").read_text()
-    commands = re.findall(r"^    sim2real (play .*)$", text, re.MULTILINE)
+    commands = re.findall(r"^    sim2real (play go2.*)$", text, re.MULTILINE)
     assert len(commands) == 3
     (tmp_path / "pipelines").symlink_to(ROOT / "pipelines")
     monkeypatch.chdir(tmp_path)
