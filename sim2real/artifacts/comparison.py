@@ -77,7 +77,7 @@ def _figures_of(run: ComparedRun) -> Mapping[str, Json]:
     if (identification := run.identification) is not None:
         figures["identification"] = identification.verdict.status
         for row in identification.held_out:
-            figures[f"error {row.seconds:g} s ahead, {row.name} [{row.unit}]"] = row.error
+            figures[f"error {row.seconds:g} s ahead, {row.joint} [{row.unit}]"] = row.error
     if (deployment := run.deployment) is not None:
         figures |= {"deployment": deployment.verdict.status} if deployment.verdict else {}
         figures |= {"episodes": len(deployment.episodes), **{g.quantity: g.real for g in deployment.gap}}

@@ -276,7 +276,7 @@ class Deployment(Shown):
 
     def sentence(self, reason: Reason) -> str:
         """Return a reason as a sentence, with the numbers of this deployment."""
-        about, joint = reason.about, next((row for row in self.replay if row.name == reason.about), None)
+        about, joint = reason.about, next((row for row in self.replay if row.joint == reason.about), None)
         changed = next((c for c in self.drift.changes if c.name == about), about) if self.drift else about
         match reason.finding:
             case Finding.SUCCESS:

@@ -12,7 +12,7 @@ from sim2real.artifacts.files import check, malformed, read_grouped, read_versio
 from sim2real.artifacts.identification import Noise
 from sim2real.artifacts.summary import ArtifactTable, Interval
 
-FORMAT = 2
+FORMAT = 3
 EPISODES, DRAWS = "episodes.json", "episodes.npz"
 _ARRAYS = ("draws", "drawn_s")
 _AGAIN = "run `sim2real train` again"
@@ -78,7 +78,7 @@ class Episodes:
 
     def noise_table(self) -> ArtifactTable:
         """Return a row for each reading with noise."""
-        rows = [[n.column, n.deviation, n.quantum, n.bias, n.unit] for n in self.noise]
+        rows = [[n.field, n.deviation, n.resolution, n.offset, n.unit] for n in self.noise]
         return ArtifactTable(("reading", "deviation", "step", "bias", "unit"), rows)
 
     def save(self, folder: Path) -> dict[str, str]:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -28,7 +29,7 @@ from sim2real.artifacts.timing import TIMING, Timing
 from sim2real.errors import Sim2RealError
 from sim2real.types import Json
 
-FORMAT = 5
+FORMAT = 6
 PARAMETERS, PREDICTIONS, FREE_RUNS, REPLAYS = "parameters.json", "predictions.npz", "free_runs.npz", "replays.npz"
 ROUND_TRIP = "round_trip_delay"
 """Name of the sum of all delays."""
@@ -46,11 +47,11 @@ class Estimate:
 
     Attributes:
         name: Its name.
-        kind: Kind of the parameter; a ``derived`` one is computed from others.
+        kind: Kind of the parameter; the round trip is ``derived`` from the delays.
         nominal: The data sheet's value.
         low95: Lower end of the 95 % interval.
         lower: Lower bound of the search.
-        verdict: ``ok``, ``at a bound``, ``not determined`` or ``fixed``; in a fit that is not accepted no parameter is
+        state: ``ok``, ``at a bound``, ``not determined`` or ``fixed``; in a fit that is not accepted no parameter is
             ``ok``.
         truth: The value in the embedded robot.
     """
@@ -61,7 +62,7 @@ class Estimate:
     about: str
     nominal: float | None
     estimate: float
-    verdict: str
+    state: str
     standard_error: float | None = None
     low95: float | None = None
     high95: float | None = None
@@ -72,7 +73,7 @@ class Estimate:
     @property
     def absent(self) -> bool:
         """Whether it is a limit that the model does not have, as no motion reaches one; tables omit it."""
-        return self.verdict == "fixed" and self.estimate == self.nominal == _NO_LIMIT
+        return self.state == "fixed" and self.estimate == self.nominal == _NO_LIMIT
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,14 @@ class Judgement:
     next: str = ""
 
 
-_COLUMN = re.compile(r"(.+?)(?:\[(\d+)\])?")
+_USE = {
+    "accepted": "these parameters may be used",
+    "record again": "this log does not determine all parameters",
+    "change the model": "do not use these parameters yet",
+    "not finished": "these parameters are no estimates yet",
+}
+"""Status -> whether the parameters may be used."""
+_FIELD = re.compile(r"(.+?)(?:\[(\d+)\])?")
 
 
 @dataclass(frozen=True)
@@ -98,142 +106,125 @@ class Noise:
     """The differences between one measured quantity and the identified model.
 
     Attributes:
-        column: A field of the sensor's message, with an index ``[i]`` if the field is a vector.
+        field: A field of the sensor's message, with an index ``[i]`` if the field is a vector.
         deviation: Standard deviation of the part that changes from sample to sample; includes jitter of sampling times.
-        quantum: Step between neighbouring readings; 0 if readings have no step.
-        bias: Standard deviation of the part that is constant over a segment.
+        resolution: Step between neighbouring readings; 0 if readings have no step.
+        offset: Standard deviation of the part that is constant over a segment.
     """
 
-    column: str
+    field: str
     unit: str
     deviation: float
-    quantum: float
-    bias: float
+    resolution: float
+    offset: float
 
     def __post_init__(self) -> None:
         """Check the numbers, which can come from a file."""
-        sizes = (self.deviation, self.quantum, self.bias)
-        check(all(math.isfinite(s) and s >= 0.0 for s in sizes), f"{self.column}: noise of {sizes}")
+        sizes = (self.deviation, self.resolution, self.offset)
+        check(all(math.isfinite(s) and s >= 0.0 for s in sizes), f"{self.field}: noise of {sizes}")
 
     @property
     def place(self) -> tuple[str, int | None]:
         """The field of the message, and the index in it; None if the field is a number."""
-        name, index = _COLUMN.fullmatch(self.column).groups()  # type: ignore[union-attr]  # .+? matches any name
+        name, index = _FIELD.fullmatch(self.field).groups()  # type: ignore[union-attr]  # .+? matches any name
         return name, None if index is None else int(index)
 
 
-Outcome = Literal["chosen", "mends", "no gain", "not reached", "not fitted"]
-
-
 @dataclass(frozen=True)
-class TriedTerm:
-    """Errors on held-out parts without and with a term.
+class Term:
+    """An optional term of the model.
 
     Attributes:
-        without: Root mean square without the term [deviations of a measurement].
-        error: The same with the term; None if the set was not fitted, because less than 5 % of gain was predicted.
-        outcome: ``chosen``; ``mends`` if the error falls by more than 5 %; ``not reached`` of a limit without effect.
+        used: Whether the model has it.
+        gain: By which share it lowers the errors on held-out parts, beside the other used terms; negative if it harms;
+            None if it was not tried.
     """
 
-    term: str
-    without: float
-    error: float | None
-    outcome: Outcome
-
-    @property
-    def gain(self) -> float | None:
-        """By which share the term lowers the error."""
-        return None if self.error is None or not self.without > 0.0 else 1.0 - self.error / self.without
+    name: str
+    used: bool
+    gain: float | None = None
 
 
-def tried_table(rows: Sequence[TriedTerm]) -> ArtifactTable:
-    """Return a row for each term."""
-    cells = [
-        [r.term, r.without, "" if r.error is None else r.error, "" if r.gain is None else f"{r.gain:.0%}", r.outcome]
-        for r in rows
-    ]
-    return ArtifactTable(("term tried", "error without", "error with", "gain", "outcome"), cells)
+def terms_table(terms: Sequence[Term]) -> ArtifactTable:
+    """Return a row for each optional term."""
+    cells = [[t.name, t.used, "" if t.gain is None else f"{t.gain:.0%}"] for t in terms]
+    return ArtifactTable(("term", "used", "gain"), cells)
 
 
 @dataclass(frozen=True)
-class Quantity:
-    """The mean of the estimates of one quantity from each recording alone.
+class OverLogs:
+    """The mean of the estimates of one parameter from each log alone.
 
     Attributes:
         standard_error: Of the mean.
-        between: Deviation between recordings, beyond their standard errors.
-        low95: Lower end of the 95 % interval for a further recording.
-        agree: Whether the standard errors explain the differences between the estimates.
+        spread: Deviation between logs, beyond their standard errors.
+        low95: Lower end of the 95 % interval for a further log.
     """
 
     name: str
     unit: str
     mean: float
     standard_error: float
-    between: float
+    spread: float
     low95: float
     high95: float
-    agree: bool
 
 
-ErrorKind = Literal["ahead", "free run"]
-AHEAD: ErrorKind = "ahead"
-FREE_RUN: ErrorKind = "free run"
-HELD_OUT = "held-out data"
-"""The held-out data of all recordings together."""
-MAX_ERROR_RATIO = 1.25
-"""Largest ratio of an error to the expected error that does not count as exceeded."""
+WITHOUT_DELAYS, STANDING_STILL, GOAL = "without delays", "standing still", "goal"
+"""Baselines beside the nominal model: the model fitted without delays, the last measurement, and the joint's goal."""
 
 
 @dataclass(frozen=True)
 class ExpectedError:
-    """The error to expect of a position on later data: 1.25 times its worst error on held-out data.
+    """The error to expect of a joint on later data: 1.25 times its worst error on held-out parts.
 
     Attributes:
-        column: The position among the measured fields, such as ``position[1]``.
-        name: Its name for people.
-        kind: ``ahead``: windows of a horizon, each from a state of its own; ``free run``: one run.
-        seconds: The horizon, or the length of the run [s].
+        seconds: How far ahead it is predicted, or the length of the free run [s].
         error: Root mean square, for motion like the fitted one.
+        free_run: Whether all of it is one prediction; else windows are predicted, each from a state of its own.
     """
 
-    column: str
-    name: str
+    joint: str
     unit: str
-    kind: ErrorKind
     seconds: float
     error: float
+    free_run: bool = False
 
     @property
     def how(self) -> str:
-        """The horizon, or the free run, as text."""
-        return _how(self.kind, self.seconds)
+        """How far ahead it is predicted, or the free run, as text."""
+        return _how(self.seconds, self.free_run)
+
+
+def _how(seconds: float, free_run: bool) -> str:
+    return f"in a free run of {seconds:.3g} s" if free_run else f"{seconds:.3g} s ahead"
 
 
 @dataclass(frozen=True)
 class ComparedError:
-    """An error on data that was not fitted, beside the expected one.
+    """The error of a joint on data that was not fitted, beside the expected error and those of baselines.
 
     Attributes:
-        source: The predicted data: all held-out data, the held-out end of a log, or a log.
+        log: The predicted log; "": all held-out parts together.
+        seconds: How far ahead it is predicted, or the length of the free run [s].
         error: Root mean square error; None if the model diverges.
-        expected: None if there were too few held-out parts.
-        wider: Factor in ``expected`` for a motion that is faster or goes further than the fitted one.
-        beaten_by: Baselines with an error that is not larger.
-        baselines: Model -> its error; None if it diverges.
+        expected: The expected error, larger for a motion that is faster or goes further than the fitted one; None if
+            there were too few held-out parts.
+        baselines: Baseline -> its error; None if it diverges.
+        as_good: The baselines that are as good.
+        field: The joint's field among the columns of samples.
     """
 
-    source: str
-    column: str
-    name: str
+    log: str
+    joint: str
     unit: str
-    kind: ErrorKind
     seconds: float
     error: float | None
+    free_run: bool = False
     expected: float | None = None
-    wider: float = 1.0
-    beaten_by: tuple[str, ...] = ()
-    baselines: Mapping[str, float | None] = field(default_factory=dict)
+    baselines: Mapping[str, float | None] = dataclasses.field(default_factory=dict)
+    as_good: tuple[str, ...] = ()
+    field: str = ""
 
     @property
     def ratio(self) -> float | None:
@@ -242,35 +233,38 @@ class ComparedError:
 
     @property
     def exceeded(self) -> bool:
-        """Whether the error is above the expected error by more than ``MAX_ERROR_RATIO``."""
-        return self.ratio is not None and self.ratio > MAX_ERROR_RATIO
+        """Whether the error is above the expected error."""
+        return self.ratio is not None and self.ratio > 1.0
 
     def __str__(self) -> str:
-        """Return the error and the expected error as a sentence."""
+        return self.text(self.log or "held-out parts")
+
+    def text(self, where: str) -> str:
+        """Return the error and the expected error as a sentence.
+
+        Args:
+            where: The predicted data.
+        """
         size = "diverges" if self.error is None else f"is off by {with_small_unit(self.error, self.unit)}"
-        text = f"{self.name} {size} {_how(self.kind, self.seconds)} on {self.source}"
+        text = f"{self.joint} {size} {_how(self.seconds, self.free_run)} on {where}"
         if self.expected is None or self.ratio is None:
             return text
         times = "" if self.error is None else f", {self.ratio:.3g} times as much"
         return f"{text}, where {with_small_unit(self.expected, self.unit)} were expected{times}"
 
 
-def _how(kind: ErrorKind, seconds: float) -> str:
-    return f"{seconds:.3g} s ahead" if kind == AHEAD else f"in a free run of {seconds:.3g} s"
-
-
-def compared_table(rows: Sequence[ComparedError], source: str) -> ArtifactTable:
-    """Return a row for each error, with those of the baselines if there are some; ``source`` heads the data's names."""
+def compared_table(rows: Sequence[ComparedError]) -> ArtifactTable:
+    """Return a row for each error, with those of the baselines if there are some."""
     models = list(dict.fromkeys(model for row in rows for model in row.baselines))
     cells = [
         [
-            *(r.name, r.source, f"{r.seconds:.3g} s {'ahead' if r.kind == AHEAD else r.kind}", r.unit),
+            *(r.joint, r.log or "all", f"{r.seconds:.3g} s {'free run' if r.free_run else 'ahead'}", r.unit),
             *(r.baselines.get(m) for m in models),
             *(math.inf if r.error is None else r.error, r.expected, "" if r.ratio is None else f"{r.ratio:.2f}"),
         ]
         for r in rows
     ]
-    return ArtifactTable(("joint", source, "predicted", "unit", *models, "error", "expected", "ratio"), cells)
+    return ArtifactTable(("joint", "log", "predicted", "unit", *models, "error", "expected", "ratio"), cells)
 
 
 _WINDOW_S = 1.0
@@ -285,39 +279,33 @@ class WorstSecond:
     """The worst second of the joint that the identified model explains worst.
 
     Attributes:
-        column: Its position's name among the columns of the samples.
-        begin_s: Start of the second in the recording [s].
+        field: The joint's field among the columns of the samples.
+        log: The name of the log.
+        begin_s: Start of the second in the log [s].
         end_s: Its end [s]; a shorter segment has a shorter one.
-        rmse: Root mean square of the residual in it; None if the model diverges.
-        of_motion: The same as a share of the motion, the deviation of all measured positions of the joint in the
-            recording; None if the model diverges.
+        error: Root mean square of the residual in it; None if the model diverges.
+        share_of_motion: The same as a share of the motion, the deviation of all measured positions of the joint in the
+            log; None if the model diverges.
     """
 
-    name: str
-    column: str
+    joint: str
+    field: str
     unit: str
-    recording: int
-    segment: int
+    log: str
     begin_s: float
     end_s: float
-    rmse: float | None
-    of_motion: float | None
+    error: float | None
+    share_of_motion: float | None
 
     @property
     def unexplained(self) -> bool:
         """Whether the model does not explain this second: a fault of the log, of the robot or of the model."""
-        return self.of_motion is None or self.of_motion >= _UNEXPLAINED
+        return self.share_of_motion is None or self.share_of_motion >= _UNEXPLAINED
 
-    @property
-    def error(self) -> str:
-        """The error with its unit."""
-        return "the model diverges" if self.rmse is None else with_small_unit(self.rmse, self.unit)
-
-    def text(self, logs: Sequence[Source]) -> str:
-        """Return joint, time and error on one line; of several recordings with the name of its file."""
-        log = logs[self.recording].path.replace("\\", "/").rsplit("/", 1)[-1] if len(logs) > 1 else ""
-        at = f"{self.begin_s:.1f} s" + (f" of {log}" if log else "")
-        return f"joint {self.name}, {at}, {self.error}"
+    def __str__(self) -> str:
+        """Return joint, time and error on one line."""
+        size = "the model diverges" if self.error is None else with_small_unit(self.error, self.unit)
+        return f"joint {self.joint}, {self.begin_s:.1f} s of {self.log}, {size}"
 
 
 def with_small_unit(value: float, unit: str) -> str:
@@ -361,19 +349,16 @@ class Link:
     """The delay of a link, estimated from the motion.
 
     Attributes:
-        name: The delay's parameter.
-        parts: Delays whose sum has this mean and 95th percentile, as a log of motion determines only their sum; the
-            link's name alone if the log determines its delay alone.
-        mean: Mean of the sum in the middle of a recording [s].
-        deviation: Standard deviation of this link's delay alone [s].
-        p95: 95th percentile of the sum [s].
+        name: The delay's parameter; or delays joined by ``+``, as a log of motion determines only their sum.
+        mean: Mean in the middle of a log [s].
+        deviation: Standard deviation [s].
+        p95: 95th percentile [s].
         lost: Share of lost messages: their reader uses the previous message again.
-        delays: Shape ``(K,)``: values of the sum [s].
+        delays: Shape ``(K,)``: values [s].
         share: Shape ``(K,)``: share of the messages with each of these values.
     """
 
     name: str
-    parts: tuple[str, ...]
     mean: Ranged
     deviation: Ranged
     p95: Ranged
@@ -386,18 +371,32 @@ def links_table(links: Sequence[Link]) -> ArtifactTable:
     """Return a row for each number of a link that the log determines."""
     rows = []
     for link in links:
-        total = " + ".join(link.parts)
         numbers = [
-            (f"{total}, mean", link.mean, 1e3, "ms"),
-            (f"{total}, 95 % of the messages", link.p95, 1e3, "ms"),
-            (f"{link.name}, deviation", link.deviation, 1e3, "ms"),
-            (f"{link.name}, lost", link.lost, 100.0, "%"),
+            ("mean", link.mean, 1e3, "ms"),
+            ("95 % of the messages", link.p95, 1e3, "ms"),
+            ("deviation", link.deviation, 1e3, "ms"),
+            ("lost", link.lost, 100.0, "%"),
         ]
         for label, r, factor, unit in numbers:
             if r.value is not None:
                 ends = (None if end is None else factor * end for end in (r.low95, r.high95))
-                rows.append([label, factor * r.value, Interval(*ends), unit])
+                rows.append([f"{link.name}, {label}", factor * r.value, Interval(*ends), unit])
     return ArtifactTable(("link", "estimate", "95 % interval", "unit"), rows)
+
+
+@dataclass(frozen=True)
+class Internal:
+    """What later stages need to predict with an identification.
+
+    Attributes:
+        motion: Joint -> lowest and highest position, and largest speed, in the fitted segments.
+        settle_s: Length of the first part of a held-out segment, to which its initial state is fitted [s].
+        world: Name of the simulated world; None for the robot's own.
+    """
+
+    motion: Mapping[str, tuple[float, float, float]] = dataclasses.field(default_factory=dict)
+    settle_s: float = 0.0
+    world: str | None = None
 
 
 @dataclass(frozen=True, repr=False)
@@ -405,27 +404,23 @@ class Identification(Shown):
     """The result of identify.
 
     Attributes:
-        logs: The fitted recordings, then the recordings that are held out whole.
-        errors: Errors of each position on held-out data: on all of it, beside baselines, up to each of several
-            horizons, the worst joint first; then ahead and in a free run of each recording, beside the expected errors.
-        expected_error: The error to expect of each position on later data, ahead and in a free run; the joint with the
+        logs: The fitted logs, then the logs that are held out whole.
+        errors: Errors of each joint on held-out parts: on all of them together, beside baselines, up to each of several
+            horizons, the worst joint first; then of each log, ahead and in a free run, beside the expected errors.
+        expected_error: The error to expect of each joint on later data, ahead and in a free run; the joint with the
             largest one beside its noise comes first.
         worst: The second in which the model explains a joint worst; None without samples.
-        aggregate: Quantities estimated from each of several recordings alone; empty for one recording.
-        motion: Column -> lowest and highest position, and largest speed, in the fitted segments.
-        tried: What optional terms gain on held-out parts; empty if none was tried.
-        terms: Optional terms of the model in the fit; None if the model has no optional terms.
+        over_logs: Parameters estimated from each of several logs alone; empty for one log.
+        terms: The optional terms that the model has, or that were tried; None if there are none.
         noise: Noise of the sensor.
-        widening: Factor on the posterior's deviations that covers errors of the model; None without a posterior.
-        settle_s: Length of the first part of a held-out segment, to which its initial state is fitted [s].
-        world: Name of the simulated world; None for the robot's own.
+        units: Field -> unit.
         posterior: Distribution from which training draws robots; None after an interrupted search.
         samples: Columns of the segments ``(N,)``: ``t``, ``into`` (since the segment's start) [s], ``segment``,
-            ``recording``, ``held_out``, and ``FIELD_measured`` and ``FIELD_MODEL`` of each field, of the
-            models ``identified``, ``no delay`` (fitted without delays) and ``nominal``.
+            ``recording``, ``held_out``, ``worst`` (whether it is in the worst second), and ``FIELD_measured`` and
+            ``FIELD_MODEL`` of each field, of the models ``identified``, ``without delays`` and ``nominal``.
         free: The same columns of the free runs; empty without free runs.
         replays: Initial states and commands of held-out segments and free runs.
-        timing: Timing of the first recording, from which training draws its delays; None if only the estimates exist.
+        timing: Timing of the first log, from which training draws its delays; None if only the estimates exist.
     """
 
     pipeline: str
@@ -435,28 +430,31 @@ class Identification(Shown):
     errors: tuple[ComparedError, ...] = ()
     expected_error: tuple[ExpectedError, ...] = ()
     worst: WorstSecond | None = None
-    aggregate: tuple[Quantity, ...] = ()
-    motion: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
-    tried: tuple[TriedTerm, ...] = ()
-    terms: tuple[str, ...] | None = None
+    over_logs: tuple[OverLogs, ...] = ()
+    terms: tuple[Term, ...] | None = None
     links: tuple[Link, ...] = ()
     noise: tuple[Noise, ...] = ()
-    widening: float | None = None
-    settle_s: float = 0.0
-    units: Mapping[str, str] = field(default_factory=dict)
-    world: str | None = None
+    units: Mapping[str, str] = dataclasses.field(default_factory=dict)
     posterior: Posterior | None = None
-    samples: Mapping[str, np.ndarray] = field(default_factory=dict)
-    free: Mapping[str, np.ndarray] = field(default_factory=dict)
-    replays: Mapping[str, np.ndarray] = field(default_factory=dict)
+    internal: Internal = Internal()
+    samples: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    free: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    replays: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
     timing: Timing | None = None
     format: int = FORMAT
+
+    @property
+    def headline(self) -> str:
+        """The status, and whether the parameters may be used."""
+        status = self.verdict.status
+        if status == "accepted" and self.worst is not None and self.worst.unexplained:
+            return "accepted, but the model does not explain one second: look at it before you use these parameters"
+        return f"{status}: {_USE[status]}" if status in _USE else status
 
     def about(self) -> Mapping[str, Json]:
         """Return pipeline, verdict, reasons, the next command and the number of parameters, by name."""
         facts = {"pipeline": self.pipeline, "verdict": self.verdict.status, "why": "; ".join(self.verdict.reasons)}
-        worst = self.worst.text(self.logs) if self.worst else ""
-        facts |= {"worst": worst, "next": self.verdict.next, "parameters": len(self.parameters)}
+        facts |= {"worst": str(self.worst or ""), "next": self.verdict.next, "parameters": len(self.parameters)}
         return {name: value for name, value in facts.items() if value}
 
     def rows(self) -> ArtifactTable:
@@ -469,27 +467,24 @@ class Identification(Shown):
         rows = [
             [
                 *(p.name, p.estimate, Interval(p.low95, p.high95), p.unit, p.nominal),
-                *((p.truth, _off(p)) if known else ()),
-                p.verdict,
+                *((p.truth, _from_truth(p)) if known else ()),
+                p.state,
             ]
             for p in self.parameters
             if not p.absent and not (summed and p.kind == "delay")
         ]
-        truth = ("truth", "off by") if known else ()
-        return ArtifactTable(("parameter", "estimate", "95 % interval", "unit", "nominal", *truth, "verdict"), rows)
+        truth = ("truth", "from the truth") if known else ()
+        return ArtifactTable(("parameter", "estimate", "95 % interval", "unit", "nominal", *truth, "state"), rows)
 
-    def recordings_table(self) -> ArtifactTable:
-        """Return a row for each quantity that is estimated from each recording alone."""
-        rows = [
-            [q.name, q.mean, q.standard_error, Interval(q.low95, q.high95), q.unit, q.between, q.agree]
-            for q in self.aggregate
-        ]
-        return ArtifactTable(("over recordings", "mean", "s.e.", "95 % of the next", "unit", "spread", "agree"), rows)
+    def logs_table(self) -> ArtifactTable:
+        """Return a row for each parameter that is estimated from each log alone."""
+        rows = [[q.name, q.mean, Interval(q.low95, q.high95), q.unit, q.spread] for q in self.over_logs]
+        return ArtifactTable(("over the logs", "mean", "95 % of the next", "unit", "spread"), rows)
 
     @property
     def held_out(self) -> tuple[ComparedError, ...]:
-        """The errors on all held-out data up to the longest horizon, the worst joint first."""
-        rows = [e for e in self.errors if (e.source, e.kind) == (HELD_OUT, AHEAD)]
+        """The errors on all held-out parts up to the longest horizon, the worst joint first."""
+        rows = [e for e in self.errors if not e.log]
         longest_s = max((e.seconds for e in rows), default=0.0)
         return tuple(e for e in rows if e.seconds == longest_s)
 
@@ -503,18 +498,19 @@ class Identification(Shown):
         """Return the expected errors of the joint with the largest one beside its noise, as text."""
         if not self.expected_error:
             return "unknown, as there are too few held-out parts, or a prediction of one diverged"
-        first, joints = self.expected_error[0], {e.column for e in self.expected_error}
-        own = [f"{with_small_unit(e.error, e.unit)} {e.how}" for e in self.expected_error if e.column == first.column]
+        first, joints = self.expected_error[0], {e.joint for e in self.expected_error}
+        own = [f"{with_small_unit(e.error, e.unit)} {e.how}" for e in self.expected_error if e.joint == first.joint]
         which = f", the worst of {len(joints)} joints" if len(joints) > 1 else ""
-        return f"{first.name} {', '.join(own)}{which}"
+        return f"{first.joint} {', '.join(own)}{which}"
 
-    def expected_of(self, column: str, kind: ErrorKind) -> ExpectedError | None:
-        """Return the expected error of a position; None if there is none."""
-        return next((e for e in self.expected_error if (e.column, e.kind) == (column, kind)), None)
+    def expected_of(self, joint: str, free_run: bool = False) -> ExpectedError | None:
+        """Return the expected error of a joint; None if there is none."""
+        return next((e for e in self.expected_error if (e.joint, e.free_run) == (joint, free_run)), None)
 
-    def errors_table(self) -> ArtifactTable:
-        """Return a row for each error on held-out data that is judged."""
-        return compared_table(self.judged, "held out")
+    @property
+    def used_terms(self) -> tuple[str, ...] | None:
+        """Names of the optional terms that the model has; None if there are no optional terms."""
+        return None if self.terms is None else tuple(t.name for t in self.terms if t.used)
 
     def needed_posterior(self, hint: str = "") -> Posterior:
         """Return the posterior.
@@ -546,11 +542,6 @@ class Identification(Shown):
     def fields(self) -> list[str]:
         """The measured fields."""
         return [n.removesuffix("_measured") for n in self.samples if n.endswith("_measured")]
-
-    @property
-    def recordings(self) -> list[int]:
-        """Numbers of the recordings in ``samples``."""
-        return np.unique(self.samples["recording"]).tolist() if self.samples else []
 
     def disjoint(self) -> np.ndarray:
         """Return a mask ``(N,)`` of the samples in segments that do not overlap an earlier one."""
@@ -619,11 +610,11 @@ class Identification(Shown):
         return replace(identification, **others)
 
 
-def _off(p: Estimate) -> str:
-    """Return the error of an estimate as a share of the truth; in its unit if the truth is 0."""
+def _from_truth(p: Estimate) -> str:
+    """Return how far an estimate is from the truth, as a share of it; in its unit if the truth is 0."""
     if p.truth is None:
         return ""
-    return f"{100 * (p.estimate / p.truth - 1):+.1f} %" if p.truth else f"{p.estimate:+.2g} {p.unit}"
+    return f"{100 * (p.estimate - p.truth) / abs(p.truth):+.1f} %" if p.truth else f"{p.estimate:+.2g} {p.unit}"
 
 
 def _columns(samples: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

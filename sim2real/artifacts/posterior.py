@@ -39,7 +39,8 @@ class Posterior:
         transform: Scale of each parameter.
         mean: Shape ``(P,)``, on the scales.
         covariance: Shape ``(P, P)``, on the scales.
-        low: Shape ``(P,)``: lower bounds on the scales.
+        lower: Shape ``(P,)``: lower bounds on the scales.
+        widening: Factor on the deviations with which draws cover the errors of the model.
 
     Raises:
         ValueError: When the sizes differ, or an entry is no number.
@@ -49,16 +50,17 @@ class Posterior:
     transform: tuple[Transform, ...]
     mean: np.ndarray
     covariance: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    widening: float = 1.0
 
     def __post_init__(self) -> None:
         """Check the distribution, which can come from a file."""
         size = len(self.names)
-        shapes = {a.shape for a in (self.mean, self.low, self.high)}
+        shapes = {a.shape for a in (self.mean, self.lower, self.upper)}
         fits = shapes == {(size,)} and self.covariance.shape == (size, size) and len(self.transform) == size
         check(fits, "the posterior has mixed sizes")
-        finite = all(np.isfinite(a).all() for a in (self.mean, self.covariance, self.low, self.high))
+        finite = all(np.isfinite(a).all() for a in (self.mean, self.covariance, self.lower, self.upper))
         check(finite, "an entry of the posterior is no number")
 
     def sample(self, rng: np.random.Generator, count: int, widen: float = 1.0) -> dict[str, np.ndarray]:
@@ -71,6 +73,6 @@ class Posterior:
         root = axes * np.sqrt(np.maximum(values, 0.0))
         x = self.mean + widen * rng.standard_normal((count, len(self.mean))) @ root.T
         # Fold draws back at the bounds: clipping would put many draws exactly on a bound.
-        folds = np.abs((x - self.low) / (self.high - self.low) % 2.0 - 1.0)
-        x = np.where((x < self.low) | (x > self.high), self.high - folds * (self.high - self.low), x)
+        folds = np.abs((x - self.lower) / (self.upper - self.lower) % 2.0 - 1.0)
+        x = np.where((x < self.lower) | (x > self.upper), self.upper - folds * (self.upper - self.lower), x)
         return {n: from_scale(t, x[:, i]) for i, (n, t) in enumerate(zip(self.names, self.transform, strict=True))}

@@ -221,10 +221,11 @@ def _run_like(config: NewConfig, like: str) -> bool:
 
 
 def calibrate(port: str, guide: Any, path: Path) -> None:
-    """Write LeRobot's calibration of the arm on a port into a file, once a person's motion has checked it.
+    """Write LeRobot's calibration of the arm on a port into a file, once a motion by hand has shown that it fits.
 
     Args:
-        guide: The module ``guide`` of the robot's pipeline.
+        guide: The pipeline's module ``guide``: the bus (``BAUD_RATE``, ``IDS``), where LeRobot keeps calibrations
+            (``calibration_of``, ``read``), and the motions to make by hand (``MIDDLE``, ``NUDGES``).
 
     Raises:
         UsageError: There is no calibration, or it is refused.

@@ -84,16 +84,14 @@ def conclude(run_dir: Path) -> None:
 def main_figures(done: StageFolder) -> dict[str, Any]:
     """Return the figures of a stage that a run prints: name -> value."""
     from sim2real.artifacts.deployment import Deployment
-    from sim2real.artifacts.identification import Identification
+    from sim2real.artifacts.identification import Identification, with_small_unit
 
     summary = done.manifest.summary
     figures = {name: summary[name] for name in _FIGURES[done.stage] if name in summary}
     if done.stage == "identify" and (rows := Identification.load(done.output("parameters")).held_out):
         worst, which = rows[0], ", the worst joint" if len(rows) > 1 else ""
-        error = worst.error
-        figures[f"error {worst.seconds:g} s ahead"] = (
-            "diverges" if error is None else f"{error:.2g} {worst.unit} of {worst.name}{which}"
-        )
+        size = "diverges" if worst.error is None else with_small_unit(worst.error, worst.unit)
+        figures[f"error {worst.seconds:g} s ahead"] = f"{worst.joint} {size}{which}"
     if done.stage == "deploy":
         real = [e.real["success"] for e in Deployment.read(done.folder).episodes if e.real.get("success") is not None]
         figures |= {"success on the robot": ", ".join(f"{value:.2f}" for value in real)} if real else {}

@@ -384,7 +384,7 @@ def links(problem: Problem, x: np.ndarray) -> tuple[Link, ...]:
     held_s = sum(float(values[n]) for n in commands)
     grid = estimate.delays + held_s
     numbers = estimate.ranged(held_s)
-    return (Link(late, (late, *commands), *numbers, lost_share(estimate.lost), grid, estimate.share),)
+    return (Link(" + ".join((late, *commands)), *numbers, lost_share(estimate.lost), grid, estimate.share),)
 
 
 def measured(table: ParameterTable) -> str:

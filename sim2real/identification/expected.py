@@ -1,4 +1,4 @@
-"""The error to expect of an identification on later data, and the errors on held-out data beside it.
+"""The error to expect of an identification on later data, and the errors on held-out parts beside it.
 
 The expected error of a joint is 1.25 times its worst error on the held-out parts of the recordings, each of a fit
 without that part; of ten and more, nine tenths of them count. A motion that is faster, or goes further, than the fitted
@@ -12,11 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from sim2real.artifacts.identification import (
-    AHEAD,
-    FREE_RUN,
-    HELD_OUT,
     ComparedError,
-    ErrorKind,
     ExpectedError,
     Identification,
 )
@@ -38,7 +34,7 @@ _WIDEST = 4.0
 def wider_for(
     fitted: Mapping[str, Extent], later: Mapping[str, Extent], positions: Sequence[Position]
 ) -> dict[str, float]:
-    """Return column -> factor of the expected error, for data whose motion goes beyond the fitted one.
+    """Return joint -> factor of the expected error, for data whose motion goes beyond the fitted one.
 
     The factor is the ratio of the largest speeds, or one more than the excess of the range of any position as a share
     of its fitted range, if that is larger. A hinge has been everywhere after a whole turn.
@@ -49,16 +45,16 @@ def wider_for(
     """
     excess, faster = 0.0, dict[str, float]()
     for p in positions:
-        if p.column not in fitted or p.column not in later:
+        if p.name not in fitted or p.name not in later:
             continue
-        (low, high, before), (lowest, highest, now) = fitted[p.column], later[p.column]
+        (low, high, before), (lowest, highest, now) = fitted[p.name], later[p.name]
         further = max(low - lowest, 0.0) + max(highest - high, 0.0)
         if p.unit == "rad":
             further = min(further, max(2 * math.pi - (high - low), 0.0))
         if high > low:
             excess = max(excess, further / (high - low))
-        faster[p.column] = now / before if before > 0.0 else 1.0
-    return {column: min(max(ratio, 1.0 + excess), _WIDEST) for column, ratio in faster.items()}
+        faster[p.name] = now / before if before > 0.0 else 1.0
+    return {joint: min(max(ratio, 1.0 + excess), _WIDEST) for joint, ratio in faster.items()}
 
 
 def with_expected_errors(
@@ -66,63 +62,60 @@ def with_expected_errors(
     positions: Sequence[Position],
     parts: Sequence[HeldOutPart],
     names: Sequence[str],
-    fitted: int,
     wider: Sequence[Mapping[str, float]],
 ) -> Identification:
-    """Return an identification with the expected errors, and its errors on held-out data beside them.
+    """Return an identification with the expected errors, and its errors on held-out parts beside them.
 
-    Held-out data is compared with what the held-out parts alone let expect. What comes after a single recording may
+    The end of a log is compared with what the held-out parts alone let expect. What comes after a single recording may
     differ from its parts, in time and in temperature, so the error on it counts as a part in the expected error.
 
     Args:
-        document: With samples, free runs, and the errors on all held-out data.
-        names: A name for each log; those that are held out whole come last.
-        fitted: Number of fitted logs.
-        wider: For each log the result of ``wider_for`` for its held-out data.
+        document: With samples, free runs, and the errors on all held-out parts.
+        names: A name for each log.
+        wider: For each log the result of ``wider_for`` for its held-out part.
     """
     compared, expected, judged = list[ComparedError](), list[ExpectedError](), dict[str, ComparedError]()
-    whole = {row.column: row for row in document.held_out}
-    kinds: tuple[ErrorKind, ...] = (AHEAD, FREE_RUN)
+    whole = {row.joint: row for row in document.held_out}
     for p in positions:
-        for kind in kinds:
+        for free_run in (False, True):
             # A joint that rests in a part has no error there.
-            those = [(part.ahead if kind == AHEAD else part.free).get(p.column) for part in parts]
+            those = [(part.free if free_run else part.ahead).get(p.column) for part in parts]
             errors = [e if math.isfinite(e) else math.inf for e in those if e is not None]
-            limit, rows, factor = _expected(errors, p), list[ComparedError](), 1.0
-            for r, error, seconds in _on_held_out(document, p, kind, len(names)):
-                factor = wider[r].get(p.column, 1.0)
+            limit, rows, later = _expected(errors, p), list[ComparedError](), list[float]()
+            for r, error, seconds in _on_held_out(document, p, free_run, len(names)):
+                factor = wider[r].get(p.name, 1.0)
                 expects = None if limit is None or not math.isfinite(limit) else factor * limit
-                source, size = _source(names, r, fitted), error if math.isfinite(error) else None
-                rows.append(ComparedError(source, p.column, p.name, p.unit, kind, seconds, size, expects, factor))
-            if kind == AHEAD and rows and len(names) == 1 and p.column in whole:  # one recording is all held-out data
-                judged[p.column] = replace(whole[p.column], expected=rows[0].expected, wider=factor)
+                size = error if math.isfinite(error) else None
+                rows.append(ComparedError(names[r], p.name, p.unit, seconds, size, free_run, expects, field=p.column))
+                later.append(error / factor if math.isfinite(error) else math.inf)
+            if not free_run and rows and len(names) == 1 and p.name in whole:  # the part of one log is all of them
+                judged[p.name] = replace(whole[p.name], expected=rows[0].expected)
             else:
                 compared += rows
-            later = [math.inf if row.error is None else row.error / row.wider for row in rows]
             everything = _expected([*errors, *later], p) if len(errors) >= _LEAST_PARTS else None
             if everything is not None and math.isfinite(everything):
-                runs = [part.run_s for part in parts] if kind == FREE_RUN else []
+                runs = [part.run_s for part in parts] if free_run else []
                 seconds = max([*(row.seconds for row in rows), *runs], default=0.0)
-                expected.append(ExpectedError(p.column, p.name, p.unit, kind, seconds, everything))
+                expected.append(ExpectedError(p.name, p.unit, seconds, everything, free_run))
     # The joint with the largest expected error beside its noise comes first.
-    sigma, sizes = {p.column: p.sigma for p in positions}, dict[str, float]()
+    sigma, sizes = {p.name: p.sigma for p in positions}, dict[str, float]()
     for row in expected:
-        sizes[row.column] = max(sizes.get(row.column, 0.0), row.error / sigma[row.column])
-    expected.sort(key=lambda row: -sizes[row.column])
-    errors = [judged.get(row.column, row) if row in document.held_out else row for row in document.errors]
+        sizes[row.joint] = max(sizes.get(row.joint, 0.0), row.error / sigma[row.joint])
+    expected.sort(key=lambda row: -sizes[row.joint])
+    errors = [judged.get(row.joint, row) if row in document.held_out else row for row in document.errors]
     return replace(document, expected_error=tuple(expected), errors=(*errors, *compared))
 
 
-def expected_at(document: Identification, column: str, error_at_horizon: float) -> float:
-    """Return the expected error of a position at a shorter horizon than the longest one.
+def expected_at(document: Identification, joint: str, error_at_horizon: float) -> float:
+    """Return the expected error of a joint at a shorter horizon than the longest one.
 
-    It has the ratio to the error on held-out data that it has at the longest horizon.
+    It has the ratio to the error on held-out parts that it has at the longest horizon.
 
     Args:
-        error_at_horizon: The error on held-out data at the shorter horizon.
+        error_at_horizon: The error on held-out parts at the shorter horizon.
     """
-    expected = document.expected_of(column, AHEAD)
-    longest = next((row.error for row in document.held_out if row.column == column), None)
+    expected = document.expected_of(joint)
+    longest = next((row.error for row in document.held_out if row.joint == joint), None)
     if expected is None or not longest:
         return error_at_horizon
     return error_at_horizon * max(1.0, expected.error / longest)
@@ -136,31 +129,25 @@ def _expected(errors: Sequence[float], p: Position) -> float | None:
     return max(_MARGIN * worst, NOISE * p.sigma)
 
 
-def _source(names: Sequence[str], recording: int, fitted: int) -> str:
-    if recording >= fitted:
-        return names[recording]
-    return f"the held-out end of {names[recording]}" if fitted > 1 else "the held-out end"
-
-
 def _on_held_out(
-    document: Identification, p: Position, kind: ErrorKind, recordings: int
+    document: Identification, p: Position, free_run: bool, logs: int
 ) -> Iterator[tuple[int, float, float]]:
-    """Yield recording, error of a position on its held-out data, and length of the prediction [s].
+    """Yield number of a log, error of a position on its held-out part, and length of the prediction [s].
 
-    A recording in which the joint rests is left out: "no motion" would always be best.
+    A log in which the joint rests is left out: "no motion" would always be best.
     """
-    columns = document.samples if kind == AHEAD else document.free
+    columns = document.free if free_run else document.samples
     if not columns:
         return
-    counted = columns["held_out"].astype(bool) & (columns["into"] > document.settle_s)
-    horizons = {row.seconds for row in document.errors if row.source == HELD_OUT}
-    for r in range(recordings):
+    counted = columns["held_out"].astype(bool) & (columns["into"] > document.internal.settle_s)
+    horizons = {row.seconds for row in document.errors if not row.log}
+    for r in range(logs):
         pick = counted & (columns["recording"] == r)
         measured = columns[f"{p.column}_measured"][pick]
         if not measured.size or np.ptp(measured) <= MOVES * p.sigma:
             continue
         off = columns[f"{p.column}_identified"][pick] - measured
-        length_s = float(columns["into"][pick].max()) - document.settle_s
-        if kind == AHEAD:  # the last sample is up to a period before the horizon
+        length_s = float(columns["into"][pick].max()) - document.internal.settle_s
+        if not free_run:  # the last sample is up to a period before the horizon
             length_s = min((h for h in horizons if h >= length_s), default=length_s)
         yield r, float(np.sqrt(np.mean(off**2))), length_s

@@ -57,17 +57,17 @@ class Fold:
 
     Attributes:
         name: For tables.
-        parts: Its stretches: recording, begin and end [s].
+        stretches: Recording, begin and end of each stretch [s].
     """
 
     name: str
-    parts: tuple[tuple[int, float, float], ...]
+    stretches: tuple[tuple[int, float, float], ...]
 
     def touches(self, spans: Sequence[Span], length_s: float) -> np.ndarray:
         """Return which segments of a length share time with this part, ``(S,)``, bool."""
         recording, begins = np.array([s.recording for s in spans]), np.array([s.begin_s for s in spans])
         touched = np.zeros(len(spans), bool)
-        for r, begin, end in self.parts:
+        for r, begin, end in self.stretches:
             within = (begins < end - _ROUNDING_S) & (begins + length_s > begin + _ROUNDING_S)
             touched |= (recording == r) & within
         return touched
@@ -82,7 +82,7 @@ def shared(parts: Sequence[Fold]) -> tuple[list[Fold], np.ndarray]:
     if len(parts) <= MOST:
         return list(parts), of
     members = [[p for p, group in zip(parts, of, strict=True) if group == g] for g in range(MOST)]
-    groups = [Fold(f"group {g + 1}", tuple(s for p in some for s in p.parts)) for g, some in enumerate(members)]
+    groups = [Fold(f"group {g + 1}", tuple(s for p in some for s in p.stretches)) for g, some in enumerate(members)]
     return groups, of
 
 
@@ -264,40 +264,46 @@ def predicted(
 def _ahead(
     windows: Problem, parts: Sequence[Fold], stacked: Mapping[str, Any], settle_s: float
 ) -> list[dict[str, float | None]]:
-    """Return the errors of the windows of each part, predicted from the first part of each window."""
-    fold, segment = np.nonzero(masks(windows, parts))
-    return _errors(windows, stacked, fold, windows.train[segment], settle_s, len(parts))
+    """Return the errors of the windows of each part, predicted from the first ``settle_s`` of each window."""
+    of, segment = np.nonzero(masks(windows, parts))
+    return _errors(windows, stacked, of, windows.train[segment], settle_s, len(parts))
 
 
 def _free(
     problem: Problem, parts: Sequence[Fold], stacked: Mapping[str, Any], settle_s: float, longest_s: float
 ) -> tuple[list[dict[str, float | None]], float]:
-    """Return the errors of a free run of each part, and the length of the runs beyond their first part [s]."""
+    """Return the errors of a free run of each part, and the length of the runs after ``settle_s`` [s]."""
     fitted = [problem.spans[i] for i in problem.train]
     where = []
     for k, part in enumerate(parts):
-        for r, begin, end in part.parts:
+        for r, begin, end in part.stretches:
             begins = [s.begin_s for s in fitted if s.recording == r]
             first, last = max(begin, min(begins)), min(end, max(begins) + problem.segment_s)
             where.append((k, Span(r, first, False), last - first))
     # Each run ends with its part; all are simulated for the length of the longest, so that one program serves them.
     lengths_s = [min(longest_s, w[2]) for w in where]
     runs = problem.recut([w[1] for w in where], max(lengths_s), ends_s=lengths_s)
-    fold = np.array([w[0] for w in where])
-    return _errors(runs, stacked, fold, np.arange(len(where)), settle_s, len(parts)), max(lengths_s) - settle_s
+    of = np.array([w[0] for w in where])
+    return _errors(runs, stacked, of, np.arange(len(where)), settle_s, len(parts)), max(lengths_s) - settle_s
 
 
 def _errors(
-    problem: Problem, stacked: Mapping[str, Any], fold: np.ndarray, segment: np.ndarray, settle_s: float, parts: int
+    problem: Problem, stacked: Mapping[str, Any], of: np.ndarray, segment: np.ndarray, settle_s: float, parts: int
 ) -> list[dict[str, float | None]]:
-    """Return the errors of each part's segments, without the first part of each segment."""
-    errors = problem.predict({n: v[fold] for n, v in stacked.items()}, segment, np.full(len(fold), settle_s))
+    """Return the errors of each part, without the first ``settle_s`` of each segment.
+
+    Args:
+        of: Shape ``(S,)``: number of the part to which each segment belongs.
+        segment: Shape ``(S,)``: numbers of the segments.
+        parts: Number of parts.
+    """
+    errors = problem.predict({n: v[of] for n, v in stacked.items()}, segment, np.full(len(of), settle_s))
     beyond = [e[t > settle_s] for e, t in zip(errors, problem.ts[segment], strict=True)]
     sigmas = [sigma for _, sigma, _ in problem.fields]
     rows = []
     for k in range(parts):
-        whole = np.sqrt(np.mean(np.concatenate([beyond[i] for i in np.flatnonzero(fold == k)]) ** 2, axis=0)) * sigmas
-        each = zip(labels(problem), whole.tolist(), moving(problem, segment[fold == k]), strict=True)
+        whole = np.sqrt(np.mean(np.concatenate([beyond[i] for i in np.flatnonzero(of == k)]) ** 2, axis=0)) * sigmas
+        each = zip(labels(problem), whole.tolist(), moving(problem, segment[of == k]), strict=True)
         rows.append({label: error if moved else None for label, error, moved in each})
     return rows
 

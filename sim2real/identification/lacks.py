@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from sim2real.artifacts.identification import FREE_RUN, Identification, Noise, with_small_unit
+from sim2real.artifacts.identification import Identification, Noise, with_small_unit
 from sim2real.identification.fit import ROUGH, as_numbers, refine
 from sim2real.identification.predictions import Position
 from sim2real.identification.residuals import Linearised, Problem
-from sim2real.identification.terms import MENDS
+from sim2real.identification.terms import ALIKE, MENDS
 
 _FAR = 3.0
 """Ratio of residuals to noise above which a term is missing."""
@@ -70,25 +70,27 @@ def find_lack(
     """Return what a model lacks.
 
     Args:
-        document: With samples, errors on held-out data, tried terms, and the worst second.
+        document: With samples, errors on held-out parts, terms, and the worst second.
         inclined: Called where gravity may have another direction; see ``turned_gravity``.
     """
-    chosen, reasons, flags, unexplained = [*(document.terms or ())], list[str](), "", False
+    chosen, reasons, flags, unexplained = [*(document.used_terms or ())], list[str](), "", False
     worst = largest_residual(document, noises, positions)
     if worst is not None and worst[1] > _FAR:
         # The residuals beside the noise, and the term that lowers them.
         position, ratio, level = worst
         unit = f" {position.unit}".rstrip()
         sentence = f"residuals of {position.name} are {ratio:.2g} times its noise of {level:.2g}{unit}"
-        best = next((t for t in document.tried if t.outcome == "mends" and t.term not in chosen), None)
-        if not document.tried:
+        tried = [t for t in document.terms or () if t.gain is not None]
+        best = max((t for t in tried if not t.used), key=lambda t: t.gain or 0.0, default=None)
+        gain = best.gain or 0.0 if best is not None else 0.0
+        if not tried:
             reasons.append(f"{sentence}: the model lacks something; no optional term was tried")
-        elif best is None:
+        elif best is None or gain <= 1.0 - 1.0 / ALIKE:
             reasons.append(f"{sentence}; no further term lowers the error on held-out parts by a tenth")
         else:
-            gain, with_it = best.gain or 0.0, f"--terms {','.join([*chosen, best.term])}"
+            with_it = f"--terms {','.join([*chosen, best.name])}"
             flags = with_it if gain > 1.0 - MENDS else ""
-            reasons.append(f"{sentence}; {best.term} lowers the error on held-out parts by {gain:.0%}: {with_it}")
+            reasons.append(f"{sentence}; {best.name} lowers the error on held-out parts by {gain:.0%}: {with_it}")
         # A base that is mounted at an angle bends all other parameters.
         if ratio > _GRAVITY and not flags and (leaning := inclined()) is not None:
             share, turns = leaning
@@ -111,8 +113,8 @@ def find_lack(
         size = "diverges"
         if math.isfinite(error):
             size = f"is off by {with_small_unit(error, position.unit)}, {share:.1%} of its range"
-        seconds = max(r.seconds for r in document.errors if (r.kind, r.column) == (FREE_RUN, position.column))
-        reasons.append(f"in free runs of {seconds:.3g} s on held-out data {position.name} {size}")
+        seconds = max(r.seconds for r in document.errors if r.free_run and r.joint == position.name)
+        reasons.append(f"in free runs of {seconds:.3g} s on held-out parts {position.name} {size}")
     # A fault in fitted data changes no held-out error, so it decides nothing; it may be why nothing else is explained.
     fault, alone = unexplained_second(document)
     if fault:
@@ -125,10 +127,9 @@ def unexplained_second(document: Identification) -> tuple[str, bool]:
     worst = document.worst
     if worst is None or not worst.unexplained:
         return "", False
-    off = document.samples[f"{worst.column}_measured"] - document.samples[f"{worst.column}_identified"]
-    alone = worst.rmse is None or worst.rmse > _ALONE * float(np.sqrt(np.nanmean(off**2)))
-    where = f"the model does not explain {worst.name} in the second from {worst.begin_s:.1f} s on: {worst.error}"
-    return f"{where}; look at the log there", alone
+    off = document.samples[f"{worst.field}_measured"] - document.samples[f"{worst.field}_identified"]
+    alone = worst.error is None or worst.error > _ALONE * float(np.sqrt(np.nanmean(off**2)))
+    return f"the model does not explain the worst second: {worst}; look at the log there", alone
 
 
 def turned_gravity(problem: Problem, values: Mapping[str, float]) -> tuple[float, dict[str, float]] | None:
@@ -186,12 +187,12 @@ def largest_residual(
     """Return the position whose residuals are largest beside its noise, the ratio, and the noise; None if unknown."""
     rows = []
     for p in positions:
-        of = next((n for n in noises if n.column == p.column), None)
+        of = next((n for n in noises if n.field == p.column), None)
         if of is None:
             continue
         off = document.samples[f"{p.column}_measured"] - document.samples[f"{p.column}_identified"]
-        off = off[np.isfinite(off) & (document.samples["into"] > document.settle_s)]
-        level = max(float(np.hypot(of.deviation, of.quantum / np.sqrt(12.0))), _FLOOR * p.sigma)
+        off = off[np.isfinite(off) & (document.samples["into"] > document.internal.settle_s)]
+        level = max(float(np.hypot(of.deviation, of.resolution / np.sqrt(12.0))), _FLOOR * p.sigma)
         if off.size:
             rows.append((p, float(np.sqrt(np.mean(off**2))) / level, level))
     return max(rows, key=lambda row: row[1], default=None)
@@ -201,7 +202,7 @@ def farthest_run(document: Identification, positions: Sequence[Position]) -> tup
     """Return the position with the largest mean error of free runs as a share of its range, the error, the share."""
     rows = []
     for p in positions:
-        errors = [row.error for row in document.errors if (row.kind, row.column) == (FREE_RUN, p.column)]
+        errors = [row.error for row in document.errors if row.free_run and row.joint == p.name]
         if errors:
             error = float(np.mean([math.inf if e is None else e for e in errors]))
             rows.append((p, error, error / max(float(np.ptp(document.samples[f"{p.column}_measured"])), 1e-300)))

@@ -274,15 +274,16 @@ class ParameterTable:
         """Return points on the parameters' scales ``(..., P)``, clipped to the bounds."""
         return np.clip(x, self.low, self.high)
 
-    def posterior(self, x: np.ndarray, covariance: np.ndarray) -> Posterior:
+    def posterior(self, x: np.ndarray, covariance: np.ndarray, widening: float = 1.0) -> Posterior:
         """Return the distribution from which training draws.
 
         Args:
             x: Shape ``(P,)``: the estimate, on the parameters' scales.
             covariance: Shape ``(P, P)``, on the parameters' scales.
+            widening: Factor on the deviations with which draws cover the errors of the model.
         """
         transform: tuple[Transform, ...] = tuple(c.transform for c in self.columns)
-        return Posterior(self.names, transform, np.asarray(x), covariance, self.low, self.high)
+        return Posterior(self.names, transform, np.asarray(x), covariance, self.low, self.high, widening)
 
     def start(self, share: float = 0.25) -> np.ndarray:
         """Return the start of a fit, ``(P,)``: each parameter at its ``begin``, delays at a share of their interval.

@@ -8,16 +8,20 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sim2real.artifacts.identification import AHEAD, HELD_OUT, ComparedError, WorstSecond, worst_window
+from sim2real.artifacts.identification import (
+    GOAL,
+    STANDING_STILL,
+    WITHOUT_DELAYS,
+    ComparedError,
+    WorstSecond,
+    worst_window,
+)
+from sim2real.errors import UsageError
 from sim2real.graph.node import TICKS_PER_S
 from sim2real.identification.model import IdentifiableModel, position_of
 from sim2real.identification.residuals import Problem
 from sim2real.log.schema import unit_of
 
-GOAL = "told"
-"""Name of the baseline that takes the newest goal for the position."""
-NO_DELAY = "no delay"
-"""The same model fitted without delays. If it is as good, the data needs no delays; that is no failure."""
 _BETTER = 0.95
 """Largest ratio of the error to that of a baseline with which a model is better."""
 NOISE = 2.0
@@ -45,7 +49,13 @@ def positions(model: IdentifiableModel, units: Mapping[str, str]) -> list[Positi
 
     Args:
         units: Field -> unit.
+
+    Raises:
+        UsageError: Two channels have one name.
     """
+    names = [c.name for c in model.channels]
+    if twice := sorted({n for n in names if names.count(n) > 1}):
+        raise UsageError(f"two measured joints are called {twice[0]!r}", hint="give each channel a label of its own")
     return [Position(position_of(c), c.name, unit_of(position_of(c), units), c.position_sigma) for c in model.channels]
 
 
@@ -61,7 +71,7 @@ def samples(
     Returns:
         Columns ``(N,)``: ``t`` and ``into`` [s], ``segment``, ``recording``, ``held_out``; for each field of a channel
         the measurement ``FIELD_measured`` and each prediction ``FIELD_MODEL``. If commands are positions, the goal of
-        the joint is in the column of the baseline ``told``.
+        the joint is in the column of the baseline ``goal``.
     """
     held_out = ~np.isin(np.arange(problem.segments), problem.train) if held_out is None else held_out
     every, fit_s = np.arange(problem.segments), np.where(held_out, settle_s, problem.segment_s)
@@ -126,8 +136,8 @@ def errors(
 ) -> list[ComparedError]:
     """Return the errors of each position up to a horizon on held-out segments, beside those of baselines.
 
-    The first model is judged; the others are baselines. The baseline ``hold`` keeps the last measurement. If commands
-    are positions, a further baseline is the goal itself. A position without data has no row.
+    The first model is judged; the others are baselines. A further baseline keeps the last measurement; if commands are
+    positions, another one is the goal itself. A position without data has no row.
 
     Args:
         columns: Result of ``samples``.
@@ -147,8 +157,8 @@ def errors(
 def ranked(found: Mapping[Position, Mapping[str, float]], horizon_s: float) -> list[ComparedError]:
     """Return errors by model beside each other, the worst position first; the first model is judged.
 
-    First come positions that a baseline beats, then those with the largest error beside the best baseline. Errors below
-    the noise of the measurement count as the noise.
+    First come positions for which a baseline is as good, then those with the largest error beside the best baseline.
+    Errors below the noise of the measurement count as the noise.
     """
     rows = []
     for p, errors_ in found.items():
@@ -157,27 +167,28 @@ def ranked(found: Mapping[Position, Mapping[str, float]], horizon_s: float) -> l
         error, noise = finite.pop(next(iter(finite))), NOISE * p.sigma
         best = min(finite.values(), default=math.inf)
         excess = max(error, noise) / max(best, noise) if math.isfinite(best) else 0.0
-        # The model without delays is a rough fit: it is shown, and decides nothing.
-        others = {m: e for m, e in finite.items() if m != NO_DELAY}
-        beaten_by = () if error <= noise else tuple(m for m, e in others.items() if error > _BETTER * e)
-        baselines = {m: e if math.isfinite(e) else None for m, e in finite.items()}
-        size = error if math.isfinite(error) else None
-        place = (HELD_OUT, p.column, p.name, p.unit, AHEAD, horizon_s)
-        rows.append((excess, ComparedError(*place, size, beaten_by=beaten_by, baselines=baselines)))
-    return [row for _, row in sorted(rows, key=lambda pair: (not pair[1].beaten_by, -pair[0]))]
+        # The model without delays decides nothing: if it is as good, the data needs no delays.
+        others = {m: e for m, e in finite.items() if m != WITHOUT_DELAYS}
+        as_good = () if error <= noise else tuple(m for m, e in others.items() if error > _BETTER * e)
+        size, *sizes = (e if math.isfinite(e) else None for e in (error, *finite.values()))
+        baselines = dict(zip(finite, sizes, strict=True))
+        rows.append(
+            (excess, ComparedError("", p.name, p.unit, horizon_s, size, False, None, baselines, as_good, p.column))
+        )
+    return [row for _, row in sorted(rows, key=lambda pair: (not pair[1].as_good, -pair[0]))]
 
 
 def _baselines(columns: Mapping[str, np.ndarray]) -> list[str]:
-    """Return the names of the baselines: ``hold``, and that of the goal if commands are positions."""
-    return ["hold", *([GOAL] if any(n.endswith(f"_{GOAL}") for n in columns) else [])]
+    """Return the names of the baselines without a model."""
+    return [STANDING_STILL, *([GOAL] if any(n.endswith(f"_{GOAL}") for n in columns) else [])]
 
 
 def _predicted(columns: Mapping[str, np.ndarray], field: str, model: str, ahead: np.ndarray) -> np.ndarray | None:
     """Return a model's prediction ``(N,)``; None without a prediction of the field.
 
-    ``hold`` keeps the last measurement before the horizon.
+    Standing still keeps the last measurement before the horizon.
     """
-    if model != "hold":
+    if model != STANDING_STILL:
         return columns.get(f"{field}_{model}")
     predicted = np.zeros_like(ahead)
     for segment in np.unique(columns["segment"]):
@@ -221,19 +232,20 @@ def replays(problem: Problem, values: Mapping[str, ArrayLike], settle_s: float, 
 
 
 def worst_second(
-    samples: Mapping[str, np.ndarray], positions: Sequence[Position], settle_s: float
-) -> WorstSecond | None:
-    """Return the worst second of all joints, recordings and segments, fitted and held-out ones; None without samples.
+    samples: Mapping[str, np.ndarray], positions: Sequence[Position], settle_s: float, logs: Sequence[str]
+) -> tuple[WorstSecond, np.ndarray] | None:
+    """Return the worst second of all joints, logs and segments, and a mask ``(N,)`` of its samples; None without any.
 
     The second with the largest error beyond the noise, as a share of the joint's motion, is the worst: so a joint that
     moves little, and a joint that moves much, can both be it. If all errors are noise, it is the second with the
     largest error in deviations of a measurement.
 
     Args:
-        samples: Result of ``prediction.samples``.
+        samples: Result of ``samples``.
         settle_s: First part of held-out segments, to which initial states were fitted; it does not count [s].
+        logs: Names of the logs.
     """
-    best: tuple[tuple[float, float], WorstSecond] | None = None
+    best: tuple[tuple[float, float], WorstSecond, np.ndarray] | None = None
     segments = list(_segments(samples, settle_s)) if samples else []
     for p in positions:
         if f"{p.column}_identified" not in samples:
@@ -249,9 +261,10 @@ def worst_second(
             score = (max(error - NOISE * p.sigma, 0.0) / still, error / p.sigma)
             if best is None or score > best[0]:
                 sizes = (error, error / still) if math.isfinite(error) else (None, None)
-                segment = int(samples["segment"][rows[0]])
-                best = score, WorstSecond(p.name, p.column, p.unit, recording, segment, begin_s, end_s, *sizes)
-    return None if best is None else best[1]
+                t_s, mask = samples["t"], np.isin(np.arange(len(squares)), rows)
+                mask &= (t_s >= begin_s) & (t_s <= end_s)
+                best = score, WorstSecond(p.name, p.column, p.unit, logs[recording], begin_s, end_s, *sizes), mask
+    return None if best is None else best[1:]
 
 
 def _segments(samples: Mapping[str, np.ndarray], settle_s: float) -> Iterator[np.ndarray]:

@@ -14,7 +14,7 @@ from sim2real.graph.episode import Episode
 from sim2real.graph.node import TICKS_PER_S, BaseNode, to_ticks
 from sim2real.graph.timeline import Timeline
 from sim2real.graph.times import Edge, Vertex
-from sim2real.identification.model import ChecksLogs, IdentifiableModel, position_of
+from sim2real.identification.model import ChecksLogs, IdentifiableModel
 from sim2real.later import jnp
 from sim2real.types import Array, PyTree
 
@@ -294,7 +294,7 @@ Extent = tuple[float, float, float]
 def extents(
     model: IdentifiableModel, recordings: Sequence[Episode], spans: Sequence[Span], length_s: float
 ) -> dict[str, Extent]:
-    """Return column -> extent of the motion of each measured position in some segments.
+    """Return joint -> extent of its motion in some segments.
 
     Args:
         length_s: Length of a segment [s].
@@ -313,7 +313,7 @@ def extents(
             rows.append((position.min(), -position.max(), -np.max(np.abs(speeds), initial=0.0)))
         if rows:
             low, high, fastest = np.min(rows, axis=0).tolist()
-            found[position_of(c)] = (low, -high, -fastest)
+            found[c.name] = (low, -high, -fastest)
     return found
 
 

@@ -12,7 +12,7 @@ from itertools import combinations
 
 import numpy as np
 
-from sim2real.artifacts.identification import Outcome, TriedTerm
+from sim2real.artifacts.identification import Term
 from sim2real.identification import held_out
 from sim2real.identification.fit import ROUGH, Fit, refine
 from sim2real.identification.held_out import Fold, HeldOutPart, Statistics, on_held_out_parts, statistics
@@ -297,29 +297,30 @@ def _proposed(
     return [one for _, one in [*ones[:1], *twos, *ones[1:]]][:_TRIED]
 
 
-def gains(selection: Selection, table: ParameterTable) -> tuple[TriedTerm, ...]:
-    """Return the terms that were tried; the chosen ones come first, then the others by their gain.
+def gains(selection: Selection, table: ParameterTable) -> tuple[Term, ...]:
+    """Return all terms with their gains; those in use come first, then the others by their gain.
 
-    A term's gain is the difference of the errors of two sets that differ by this term. If there are several such pairs,
-    the one closest to the chosen set counts.
+    A gain is the difference of the errors of two sets that differ by this term. Of a term in use, the pair that is
+    closest to the chosen set counts. Of another one, only the chosen set with it: its gain beside a smaller set may be
+    that of a term that was chosen since. A term with which free runs are far worse harms, whatever it gains ahead.
     """
     rows, chosen = [], selection.chosen
-    for i, term in enumerate(table.terms):
-        one = np.arange(len(table.terms)) == i
+    for i, name in enumerate(table.terms):
+        one, used = np.arange(len(table.terms)) == i, bool(chosen.present[i])
         pairs = [
             (with_it, without)
             for with_it in selection.trials
             for without in selection.trials
             if not without.present[i] and np.array_equal(with_it.present, without.present | one)
+            if used or np.array_equal(without.present, chosen.present)
         ]
         if not pairs:
-            missing: Outcome = "chosen" if chosen.present[i] else "not fitted"
-            rows.append(TriedTerm(term, chosen.error, None, missing))
+            rows.append(Term(name, used))
             continue
         off = [int(np.sum((with_it.present ^ chosen.present) & ~one)) for with_it, _ in pairs]
         with_it, without = pairs[int(np.argmin(off))]
-        # Beside the chosen set; a gain beside a smaller one may be that of a term that was chosen since.
-        mends = np.array_equal(without.present, chosen.present) and with_it.is_better_than(without)
-        outcome: Outcome = "mends" if mends else "no gain"
-        rows.append(TriedTerm(term, without.error, with_it.error, "chosen" if chosen.present[i] else outcome))
-    return tuple(sorted(rows, key=lambda r: (r.outcome != "chosen", -(r.gain or 0.0))))
+        before, after = without.error, with_it.error
+        if with_it.free_error > _FAR * without.free_error:
+            before, after = without.free_error, with_it.free_error
+        rows.append(Term(name, used, 1.0 - after / before if before > 0.0 else None))
+    return tuple(sorted(rows, key=lambda row: (not row.used, -(row.gain or 0.0))))

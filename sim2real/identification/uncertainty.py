@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from sim2real.artifacts.identification import Noise, Quantity
+from sim2real.artifacts.identification import Noise, OverLogs
 from sim2real.errors import UsageError
 from sim2real.identification.parameters import ParameterTable
 from sim2real.identification.residuals import Linearised, Problem, of_recordings
@@ -39,8 +39,6 @@ _BY_CHANCE = (0.2, 0.05)
 in full in this one: a sharp limit doubled an interval, or did not, by the last digits of a fit."""
 _TAKES_PART = 0.1
 """Smallest entry with which a parameter takes part in a direction, as a share of the largest entry."""
-_DISAGREES = 0.01
-"""Probability by chance, in a chi-square test, below which recordings disagree."""
 _ORDER, _GAIN = 3, 20.0
 """Differences of this order remove slow changes, such as the errors of a model; the variance of those of white noise of
 variance 1: 1 + 9 + 9 + 1."""
@@ -286,7 +284,7 @@ def _groups(directions: np.ndarray) -> list[list[int]]:
     return groups
 
 
-def compare_recordings(problem: Problem, at: Linearised) -> tuple[Quantity, ...]:
+def compare_recordings(problem: Problem, at: Linearised) -> tuple[OverLogs, ...]:
     """Return each quantity by each recording alone, by a linear step from the estimate of all, and its spread.
 
     So recordings differ by changes of the robot, and not by the optimum that a search reached.
@@ -308,7 +306,7 @@ def compare_recordings(problem: Problem, at: Linearised) -> tuple[Quantity, ...]
     return tuple(rows)
 
 
-def aggregate(estimates: np.ndarray, errors: np.ndarray, name: str = "", unit: str = "") -> Quantity:
+def aggregate(estimates: np.ndarray, errors: np.ndarray, name: str = "", unit: str = "") -> OverLogs:
     """Combine estimates ``(K,)`` and their standard errors ``(K,)`` by a random-effects model (DerSimonian and Laird).
 
     The standard error of one recording excludes the differences between recordings: temperature, wear, the errors of
@@ -328,17 +326,7 @@ def aggregate(estimates: np.ndarray, errors: np.ndarray, name: str = "", unit: s
     w = 1.0 / (s**2 + between)
     mean, error = float(np.sum(w * x) / np.sum(w)), float(np.sqrt(1.0 / np.sum(w)))
     reach = float(special.stdtrit(max(len(x) - 2, 1), 0.975)) * np.sqrt(between + error**2 + float(np.median(s**2)))
-    agree = q <= float(special.chdtri(len(x) - 1, _DISAGREES))
-    return Quantity(
-        name,
-        unit,
-        mean,
-        error,
-        float(np.sqrt(between)),
-        mean - reach,
-        mean + reach,
-        agree,
-    )
+    return OverLogs(name, unit, mean, error, float(np.sqrt(between)), mean - reach, mean + reach)
 
 
 def noises(samples: Mapping[str, np.ndarray], units: Mapping[str, str]) -> tuple[Noise, ...]:

@@ -1,4 +1,4 @@
-"""The verdict on an identification: judged on held-out data, position by position."""
+"""The verdict on an identification: judged on held-out parts, joint by joint."""
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 
 from sim2real.artifacts.identification import (
-    AHEAD,
     ROUND_TRIP,
+    WITHOUT_DELAYS,
     ComparedError,
     Estimate,
     ExpectedError,
@@ -20,7 +20,6 @@ from sim2real.artifacts.identification import (
 from sim2real.identification.held_out import HeldOutPart
 from sim2real.identification.lacks import Lack
 from sim2real.identification.parameters import Parameter, ParameterTable
-from sim2real.identification.predictions import NO_DELAY
 from sim2real.identification.uncertainty import ABSENT, BOUND, NOT_REACHED, OK, Determined, Uncertainty
 
 Status = Literal["accepted", "record again", "change the model", "not finished"]
@@ -29,9 +28,9 @@ RECORD: Status = "record again"
 CHANGE: Status = "change the model"
 NOT_FINISHED: Status = "not finished"
 _BETTER = 0.95
-"""Largest ratio of the held-out error to that of a baseline with which the estimate is better."""
+"""Largest ratio of the error to that of the model without delays with which delays are needed."""
 _MOST = 3
-"""Largest number of positions that the reasons name, the worst first."""
+"""Most joints that the reasons name, the worst first."""
 _WIDER = 4.0
 """Factor between the old and the new bound on a logarithmic scale."""
 _LONGEST_S = 1.0
@@ -42,13 +41,6 @@ _ALONE = 0.99
 """Share of the information on a parameter above which one part of the recordings determines it alone."""
 _APART = 2.0
 """Ratio of the error on that part to that on each other one from which on it decides the expected error."""
-_BASELINES = {"no delay": "the model without delays", "hold": "standing still", "nominal": "the nominal model"}
-
-
-def errors_of(row: ComparedError) -> dict[str, float]:
-    """Return model -> root mean square error of a position; infinite where the model diverged."""
-    errors = {"identified": row.error, **row.baselines}
-    return {model: math.inf if error is None else error for model, error in errors.items()}
 
 
 def judge(
@@ -70,13 +62,13 @@ def judge(
     """Judge an identification; ``next`` of the result are flags with which to identify again.
 
     Args:
-        held_out: Errors of the positions, the worst first.
+        held_out: Errors of the joints, the worst first.
         x: Shape ``(P,)``: the estimate, on the parameters' scales.
         max_delay_s: Longest delay of the model [s].
         widened: Parameters whose bounds the user has set: wider ones would not help again.
         doubts: Further sentences, which decide nothing.
         left: Length of the next step of a fit that did not converge [standard errors]; None if it converged.
-        exceeded: Sentences about errors on held-out data above the expected ones.
+        exceeded: Sentences about errors on held-out parts above the expected ones.
         lacks: What the model lacks.
         too_seldom: A sentence on a log whose commands are logged too seldom for its motion, or "".
         offers_terms: Whether ``--terms auto`` would compare terms that the model lacks.
@@ -92,11 +84,6 @@ def judge(
     reasons = [*errors, *doubts, *bounded, *_absent(table, spread)]
     reasons += [f"{name} is estimated at its lowest possible value, 0; the fit is the same with 0" for name in at_zero]
     reasons += undetermined
-    if spread.misfit > 3.0:
-        reasons.append(
-            f"residuals are {spread.misfit:.2g} times the measurement's deviation: the model explains the data only in "
-            "part, and intervals follow how much estimates vary from block to block"
-        )
     # The first rule that holds decides the status, and its sentences come first. Wider bounds do not help a model that
     # lacks a term, as it bends its other parameters; nor does another recording before terms and bounds are right.
     lacking = [*lacks.reasons, *exceeded]
@@ -149,7 +136,7 @@ def estimates(
         rows.append(replace(row, **numbers))
     # The sum of all delays, of which one is identified.
     delays = [row for row in rows if row.kind == "delay"]
-    free, held = [r for r in delays if r.verdict != "fixed"], [r.estimate for r in delays if r.verdict == "fixed"]
+    free, held = [r for r in delays if r.state != "fixed"], [r.estimate for r in delays if r.state == "fixed"]
     if len(free) == 1:
         ends = {n: getattr(free[0], n) for n in ("estimate", "low95", "high95", "lower", "upper")}
         ends = {n: None if value is None else value + sum(held) for n, value in ends.items()}
@@ -164,14 +151,17 @@ def _state_of(verdict: str, p: Parameter, upper: bool) -> str:
     return "ok" if verdict in (OK, ABSENT) else "not determined"
 
 
-def decisive_part(parts: Sequence[HeldOutPart], expected: Sequence[ExpectedError]) -> str:
+def decisive_part(parts: Sequence[HeldOutPart], expected: Sequence[ExpectedError], fields: Mapping[str, str]) -> str:
     """Return a sentence about the part that decides the expected error as it alone determines parameters, or "".
 
     A fit without that part has these parameters near their nominal values, and predicts the part far worse than a fit
     of all recordings does.
+
+    Args:
+        fields: Joint -> its measured field.
     """
     for row in expected:
-        errors = [(part.ahead if row.kind == AHEAD else part.free).get(row.column) for part in parts]
+        errors = [(part.free if row.free_run else part.ahead).get(fields[row.joint]) for part in parts]
         sizes = [e if e is not None and math.isfinite(e) else 0.0 for e in errors]
         order = sorted(range(len(parts)), key=lambda k: -sizes[k])
         if len(parts) < 2 or sizes[order[0]] < _APART * sizes[order[1]] or sizes[order[0]] < row.error / _APART:
@@ -180,7 +170,7 @@ def decisive_part(parts: Sequence[HeldOutPart], expected: Sequence[ExpectedError
         if names := [name for name, share in part.share.items() if share > _ALONE]:
             error = f"{with_small_unit(row.error, row.unit)} {row.how}"
             return (
-                f"{part.name} alone determines {', '.join(names)}: the expected error of {row.name}, {error}, is that "
+                f"{part.name} alone determines {', '.join(names)}: the expected error of {row.joint}, {error}, is that "
                 f"of a fit without it; {_SECOND}{part.name}"
             )
     return ""
@@ -215,45 +205,33 @@ def _absent(table: ParameterTable, spread: Uncertainty) -> list[str]:
 
 
 def _on_held_out(held_out: Sequence[ComparedError]) -> tuple[bool, list[str]]:
-    """Return whether every position beats every baseline on held-out data, and sentences about it."""
+    """Return whether every joint beats every baseline on held-out parts, and sentences about it."""
     if not held_out:
-        return True, ["no data was held out: the error of its predictions is unknown"]
-    ahead = f"{held_out[0].seconds:g} s ahead on held-out data"
-    worse = [s for s in held_out if s.beaten_by]
-    if worse:
-        reasons = [f"{ahead} {s.name} is no better than: {_errors(s)}" for s in worse[:_MOST]]
-        return False, reasons + [f"nor are {len(worse) - _MOST} more positions"] * (len(worse) > _MOST)
-    reasons = [f"{ahead} {_off(s)}" for s in held_out[:_MOST]]
-    if len(held_out) > _MOST:
-        reasons.append(f"{len(held_out) - _MOST} more positions improve at least as much")
-    if not any(_needs_delay(s) for s in held_out):
-        reasons.append("without any delay it predicts as well: this data does not need one")
-    return True, reasons
+        return True, ["no part was held out: the error of its predictions is unknown"]
+    worse = [row for row in held_out if row.as_good]
+    reasons = [_beside_baselines(row) for row in (worse or held_out)[:_MOST]]
+    if (more := len(worse or held_out) - _MOST) > 0:
+        reasons.append(f"nor are {more} more joints" if worse else f"{more} more joints improve at least as much")
+    if not worse and not any(_needs_delay(row) for row in held_out):
+        reasons.append("without delays it predicts as well: this data needs none")
+    return not worse, reasons
 
 
-def _off(row: ComparedError) -> str:
-    """Return how far a position is off, and how far the best baseline is."""
-    errors = errors_of(row)
-    sentence = f"{row.name} is off by {errors.pop('identified'):.2g} {row.unit}".rstrip()
-    best = min(errors, key=lambda model: errors[model], default=None)
-    if best is None or not math.isfinite(errors[best]):
-        return sentence
-    if not errors[best]:
-        return f"{sentence}, where {best} is exact"
-    return f"{sentence}; {_BASELINES.get(best, best)} by {errors[best]:.2g} {row.unit}".rstrip()
+def _beside_baselines(row: ComparedError) -> str:
+    """Return the error of a joint, and the baselines that are as good, or the best one."""
+    sentence = str(row)
+    finite = {name: e for name, e in row.baselines.items() if e is not None and name != WITHOUT_DELAYS}
+    if row.as_good:
+        better = (f"{name} ({with_small_unit(finite[name], row.unit)})" for name in row.as_good)
+        return f"{sentence}, no better than {', '.join(better)}"
+    best = min(finite, key=lambda name: finite[name], default="")
+    return f"{sentence}; the best baseline, {best}, by {with_small_unit(finite[best], row.unit)}" if best else sentence
 
 
 def _needs_delay(row: ComparedError) -> bool:
     """Return whether the same model without delays is worse."""
-    errors = errors_of(row)
-    return NO_DELAY not in errors or errors["identified"] < _BETTER * errors[NO_DELAY]
-
-
-def _errors(row: ComparedError) -> str:
-    """Return the baselines that beat a position, with the errors."""
-    errors, unit = errors_of(row), f" {row.unit}".rstrip()
-    better = ", ".join(f"{m} ({errors[m]:.2g}{unit})" for m in row.beaten_by)
-    return f"{better}; its own error is {errors['identified']:.2g}{unit}"
+    other = row.baselines.get(WITHOUT_DELAYS, math.inf)
+    return other is None or (row.error is not None and row.error < _BETTER * other)
 
 
 def _at_bounds(

@@ -73,7 +73,7 @@ class SimSensor(BaseNode):
         """The sizes of the noise; see ``HoldsData``."""
         if self._sizes is not None or not self.noise:
             return self._sizes
-        numbers = np.array([(n.deviation, n.quantum, n.bias) for n in self.noise], np.float32)
+        numbers = np.array([(n.deviation, n.resolution, n.offset) for n in self.noise], np.float32)
         return NoiseSizes(*numbers.T)
 
     def with_data(self, data: NoiseSizes) -> SimSensor:
@@ -114,7 +114,7 @@ class SimSensor(BaseNode):
             field, index = noise.place
             value = jnp.asarray(changed.get(field, getattr(message, field)))
             entry = (value if index is None else value[index]) + error
-            entry = quantum * jnp.round(entry / quantum) if noise.quantum else entry
+            entry = quantum * jnp.round(entry / quantum) if noise.resolution else entry
             changed[field] = entry if index is None else value.at[index].set(entry)
         return message.replace(**changed)
 

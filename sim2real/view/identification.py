@@ -6,10 +6,14 @@ from dataclasses import replace
 import numpy as np
 
 from sim2real.artifacts.identification import (
+    GOAL,
+    WITHOUT_DELAYS,
     Identification,
     Link,
+    compared_table,
     links_table,
-    tried_table,
+    terms_table,
+    with_small_unit,
 )
 from sim2real.artifacts.run import StageFolder
 from sim2real.artifacts.summary import ArtifactTable
@@ -23,18 +27,12 @@ from sim2real.view.blocks import (
     Tile,
     Tone,
     about,
-    number,
     pretty_unit,
     sentence,
 )
 from sim2real.view.panels import Line, Panel, compared, over_time, with_gaps, with_unit
 
-_TITLES: dict[str, tuple[Tone, str]] = {
-    "accepted": ("good", "Accepted"),
-    "record again": ("doubt", "Record again: the data does not determine every parameter"),
-    "change the model": ("bad", "Change the model: do not use these parameters yet"),
-    "not finished": ("doubt", "Not finished: these values are no estimates yet"),
-}
+_TONES: dict[str, Tone] = {"accepted": "good", "change the model": "bad"}
 _MOST_COMPARED = 12
 """Rows of errors beside the expected ones that are not folded."""
 _MAX_PANELS = 6
@@ -42,9 +40,6 @@ _MOST_JOINTS = 6
 """Joints whose expected errors are not folded."""
 _AROUND_S = 1.0
 """Time that is drawn before and after the worst second [s]."""
-_GOAL = "told"
-"""Baseline whose predictions are the goals of joints."""
-_LABELS = {"no delay": "model fitted without delays", "identified": "identified model", "measured": "measured"}
 
 
 def identify_section(artifact: StageFolder) -> PageSection:
@@ -53,8 +48,7 @@ def identify_section(artifact: StageFolder) -> PageSection:
     blocks = [
         *_expected(result),
         _parameter_table(result),
-        *_recordings(result),
-        *tried_blocks(result),
+        *_tables(result),
         *link_blocks(result.links),
         *_free_runs(result),
         *about(artifact),
@@ -66,25 +60,28 @@ def identify_section(artifact: StageFolder) -> PageSection:
 
 def identify_banner(result: Identification) -> Banner | None:
     """Return the verdict, its deciding reason, the expected error and what to do next; None before it is judged."""
-    status = result.verdict.status
+    status, worst = result.verdict.status, result.worst
     if not status:
         return None
-    tone, title = _TITLES.get(status, ("doubt", status[:1].upper() + status[1:]))
-    if status == "accepted" and result.worst is not None and result.worst.unexplained:
-        tone, title = "doubt", "Accepted, but the model does not explain one second"
-    first, *others = [sentence(r, [h.name for h in result.held_out]) for r in result.verdict.reasons] or [""]
+    tone = _TONES.get(status, "doubt")
+    if tone == "good" and worst is not None and worst.unexplained:
+        tone = "doubt"
+    first, *others = [sentence(r, [row.joint for row in result.held_out]) for r in result.verdict.reasons] or [""]
     following = f"Next: {result.verdict.next}" if result.verdict.next else ""
     reasons = [first, f"Expected error: {result.outlook()}.", following, *others]
-    return Banner(tone, title, [reason for reason in reasons if reason])
+    return Banner(tone, sentence(result.headline), [reason for reason in reasons if reason])
 
 
 def _tiles(result: Identification) -> Iterator[Tile]:
-    """Yield the worst position and the delays."""
+    """Yield the worst joint and the delays."""
     for row in result.held_out[:1]:
-        which = f"{row.name}, the worst of {len(result.held_out)}," if len(result.held_out) > 1 else row.name
-        note = ", ".join(f"{m} {number(e, 3)}" for m, e in row.baselines.items())
-        error = f"{number(row.error, 3)} {pretty_unit(row.unit)}".strip()
-        yield Tile(f"held-out RMSE of {which} after {row.seconds:g} s", error, note)
+        which = f"{row.joint}, the worst of {len(result.held_out)}," if len(result.held_out) > 1 else row.joint
+        sizes = [
+            "diverges" if e is None else pretty_unit(with_small_unit(e, row.unit))
+            for e in (row.error, *row.baselines.values())
+        ]
+        note = ", ".join(f"{name} {size}" for name, size in zip(row.baselines, sizes[1:], strict=True))
+        yield Tile(f"error of {which} {row.seconds:g} s ahead on held-out parts", sizes[0], note)
     for e in result.parameters:
         if e.kind == "derived" and e.unit == "s":
             error = "" if e.standard_error is None else f" ± {1e3 * e.standard_error:.1f}"
@@ -101,34 +98,32 @@ def worst_figure(result: Identification, name: str) -> FigureBlock | None:
     None if the worst second or the samples are missing.
     """
     worst, s = result.worst, result.samples
-    if worst is None or f"{worst.column}_identified" not in s:
+    if worst is None or not {"worst", f"{worst.field}_identified"} <= set(s):
         return None
     # The segment of the worst second comes first, then those around it that do not overlap it.
     begin_s, end_s = worst.begin_s - _AROUND_S, worst.end_s + _AROUND_S
-    inside = s["segment"] == worst.segment
+    inside = s["segment"] == s["segment"][s["worst"]][0]
     first_s, last_s = float(s["t"][inside].min()), float(s["t"][inside].max())
-    apart = (s["recording"] == worst.recording) & ((s["t"] < first_s) | (s["t"] > last_s))
+    apart = (s["recording"] == s["recording"][inside][0]) & ((s["t"] < first_s) | (s["t"] > last_s))
     rows = np.flatnonzero((inside | (result.disjoint() & ~inside & apart)) & (s["t"] >= begin_s) & (s["t"] <= end_s))
     rows = rows[np.argsort(s["t"][rows], kind="stable")]
     t_s, pieces = s["t"][rows], s["segment"][rows]
     lines = [
-        Line(*with_gaps(t_s, s[f"{worst.column}_{column}"][rows], pieces), role, role)
-        for column, role in ((_GOAL, "command"), ("measured", "measured"), ("identified", "identified"))
-        if f"{worst.column}_{column}" in s
+        Line(*with_gaps(t_s, s[f"{worst.field}_{column}"][rows], pieces), role, role)
+        for column, role in ((GOAL, "command"), ("measured", "measured"), ("identified", "identified"))
+        if f"{worst.field}_{column}" in s
     ]
-    unit, scale = unit_of(worst.column, result.units) or worst.unit, 1.0
-    label = f"{worst.name} [{unit}]" if unit else worst.name
-    if unit in ("rad", "m") and worst.rmse is not None and worst.rmse < 0.1:
+    unit, scale = unit_of(worst.field, result.units) or worst.unit, 1.0
+    label = f"{worst.joint} [{unit}]" if unit else worst.joint
+    if unit in ("rad", "m") and worst.error is not None and worst.error < 0.1:
         unit, scale = f"m{unit}", 1e3
-    rest = s[f"{worst.column}_measured"][rows].astype(float) - s[f"{worst.column}_identified"][rows]
+    rest = s[f"{worst.field}_measured"][rows].astype(float) - s[f"{worst.field}_identified"][rows]
     residual = f"residual [{unit}]" if unit else "residual"
     difference = Line(*with_gaps(t_s, scale * rest, pieces), residual, "residual")
     svg = compared(lines, difference, label, (worst.begin_s, worst.end_s), name)
-    size = ""
-    if worst.of_motion is not None:
-        size = f", {worst.of_motion:.0%} of the joint's motion"
+    size = "" if worst.share_of_motion is None else f", {worst.share_of_motion:.0%} of the joint's motion"
     meaning = "Residual: measured \u2212 identified; the error is its root mean square in this second."
-    return FigureBlock(svg, f"The worst second: {worst.text(result.logs)}{size}. {meaning}")
+    return FigureBlock(svg, f"The worst second: {worst}{size}. {meaning}")
 
 
 # -- parameters
@@ -141,20 +136,12 @@ def _parameter_table(result: Identification) -> TableBlock:
     return replace(table, remarks=[meanings[row[0]] for row in table.rows])
 
 
-def _recordings(result: Identification) -> list[Block]:
-    """Return the estimates from each recording alone, and their spread."""
-    if not result.aggregate:
-        return []
-    loose = ", ".join(q.name for q in result.aggregate if not q.agree)
-    agreement = f"differ in {loose} by more than the standard errors" if loose else "agree in all quantities"
-    caption = f"Means of the estimates from each recording alone, which {agreement}"
-    return [TableBlock.of(caption, result.recordings_table())]
-
-
-def tried_blocks(result: Identification) -> list[Block]:
-    """Return the table of the tried terms; nothing if none was tried."""
-    caption = "Optional terms: root mean square error on held-out parts, in deviations of a measurement"
-    return [TableBlock.of(caption, tried_table(result.tried))] if result.tried else []
+def _tables(result: Identification) -> list[Block]:
+    """Return the estimates from each log alone with their spread, and the optional terms, if there are some."""
+    over = "Means of the estimates from each log alone, and their spread beyond the standard errors"
+    terms = "Optional terms: by which share each lowers the errors on held-out parts"
+    blocks: list[Block] = [TableBlock.of(over, result.logs_table())] if result.over_logs else []
+    return [*blocks, TableBlock.of(terms, terms_table(result.terms))] if result.terms else blocks
 
 
 # -- delays of links
@@ -170,20 +157,21 @@ def link_blocks(links: Sequence[Link]) -> list[Block]:
 
 
 def _expected(result: Identification) -> list[Block]:
-    """Return the expected errors, and the errors on held-out data beside them, the largest ratios first."""
-    known = {(e.name, e.how): e for e in result.expected_error}
+    """Return the expected errors, and the errors on held-out parts beside them, the largest ratios first."""
+    known = {(e.joint, e.how): e for e in result.expected_error}
     joints, kinds = (list(dict.fromkeys(key[i] for key in known)) for i in (0, 1))
     rows = [
         [joint, *(known[joint, how].error if (joint, how) in known else None for how in kinds), unit]
-        for joint, unit in {e.name: e.unit for e in result.expected_error}.items()
+        for joint, unit in {e.joint: e.unit for e in result.expected_error}.items()
     ]
     lead = TableBlock.of(
         "Expected errors, for motion like the fitted one", ArtifactTable(("joint", *kinds, "unit"), rows)
     )
     # The verdict has those of a single joint.
     blocks: list[Block] = [replace(lead, folded=len(joints) > _MOST_JOINTS)] if len(joints) > 1 else []
-    table = TableBlock.of("Errors on held-out data beside the expected errors and baselines", result.errors_table())
-    judged = [row.exceeded or bool(row.beaten_by) for row in result.judged]
+    caption = "Errors on held-out parts beside the expected errors and baselines"
+    table = TableBlock.of(caption, compared_table(result.judged))
+    judged = [row.exceeded or bool(row.as_good) for row in result.judged]
     tones: list[Tone] = ["bad" if worse else "good" for worse in judged]
     first = replace(table, rows=table.rows[:_MOST_COMPARED], tones=tones[:_MOST_COMPARED])
     more = replace(table, rows=table.rows[_MOST_COMPARED:], tones=tones[_MOST_COMPARED:], folded=True)
@@ -192,27 +180,27 @@ def _expected(result: Identification) -> list[Block]:
 
 
 def _free_runs(result: Identification) -> list[Block]:
-    """Return the figure of the held-out data, each recording in one simulation; nothing without free runs."""
+    """Return the figure of the held-out parts, each recording in one simulation; nothing without free runs."""
     if not result.free:
         return []
     recordings = np.unique(result.free["recording"]).tolist()
-    caption = "All held-out data in one simulation, from one initial state, with the recorded commands and timing."
+    caption = "The held-out part of each log in one simulation from one initial state, with its commands and timing."
     hidden = len(result.fields) * len(recordings) - len(_panels(result, recordings))
     caption += f" {hidden} further panels are not shown." if hidden else ""
     return [FigureBlock(free_runs_svg(result, "identify-free"), caption)]
 
 
 def free_runs_svg(result: Identification, name: str) -> str:
-    """Draw the held-out part of each recording, and one simulation of all of it with its errors."""
+    """Draw the held-out part of each log, and one simulation of all of it with its errors."""
     panels = []
     for recording, field in _panels(result, np.unique(result.free["recording"]).tolist()):
         rows = result.free["recording"] == recording
         segments, counts = np.unique(result.free["segment"][rows], return_counts=True)
         rows &= result.free["segment"] == segments[counts.argmax()]  # the longest segment
         t_s = result.free["t"][rows]
-        models = [m for m in ("measured", "no delay", "identified") if f"{field}_{m}" in result.free]
-        lines = [Line(t_s, result.free[f"{field}_{m}"][rows].astype(float), _LABELS[m], m) for m in models]
-        settled = t_s[result.free["into"][rows] <= result.settle_s]
+        models = [m for m in ("measured", WITHOUT_DELAYS, "identified") if f"{field}_{m}" in result.free]
+        lines = [Line(t_s, result.free[f"{field}_{m}"][rows].astype(float), m, m) for m in models]
+        settled = t_s[result.free["into"][rows] <= result.internal.settle_s]
         spans = [(float(settled[0]), float(settled[-1]))] if len(settled) else []
         panels.append(
             Panel(
@@ -223,7 +211,7 @@ def free_runs_svg(result: Identification, name: str) -> str:
                 framed=("measured", "identified"),
             )
         )
-    label = "The held-out part of each recording, measured and simulated from one initial state"
+    label = "The held-out part of each log, measured and simulated from one initial state"
     return over_time(panels, name, label, shade="initial state fitted here")
 
 
@@ -234,12 +222,8 @@ def _panels(result: Identification, recordings: Sequence[int]) -> list[tuple[int
 
 
 def _title(result: Identification, recording: int) -> str:
-    """Return the name of a recording; empty for a single recording."""
-    names = _log_names(result)
-    if len(result.recordings) < 2:
+    """Return the name of a log; empty for a single log."""
+    names = [log.path.replace("\\", "/").rsplit("/", 1)[-1] for log in result.logs]
+    if len(np.unique(result.samples.get("recording", ()))) < 2:
         return ""
-    return names[recording] if recording < len(names) else f"recording {recording}"
-
-
-def _log_names(result: Identification) -> list[str]:
-    return [log.path.replace("\\", "/").rsplit("/", 1)[-1] for log in result.logs]
+    return names[recording] if recording < len(names) else f"log {recording + 1}"

@@ -27,9 +27,9 @@ def model_card_page(
     """
     about, status = card["about"], card["verdict"]["status"]
     blocks: list[Block] = [NoteBlock(text) for text in card["notes"]]
-    headers = ("parameter", "estimate", "95 % interval", "unit", "verdict", "about")
+    headers = ("parameter", "estimate", "95 % interval", "unit", "state", "about")
     rows = [
-        [p["name"], p["estimate"], Interval(p["low95"], p["high95"]), p["unit"], p["verdict"], p["about"]]
+        [p["name"], p["estimate"], Interval(p["low95"], p["high95"]), p["unit"], p["state"], p["about"]]
         for p in card["parameters"]
     ]
     blocks.append(TableBlock.of("Parameters", ArtifactTable(headers, rows)))

@@ -242,7 +242,7 @@ def deploy_section(artifact: StageFolder) -> PageSection:
     blocks: list[Block] = [NoteBlock(text) for log in logs for text in log.warnings]
     # Draw each episode beside its simulation.
     units = logs[0].units
-    joints = {row.column: row.name for row in deployed.replay}
+    joints = {row.field: row.joint for row in deployed.replay}
     episodes = [
         pairs_of(log, simulated_beside(columns, log), joints)
         for log, columns in zip(logs, deployed.simulated, strict=True)
@@ -264,7 +264,7 @@ def deploy_section(artifact: StageFolder) -> PageSection:
         tiles.append(Tile("success on the robot", f"{success.real:.0%}", note))
     tiles += [Tile("episodes", str(len(deployed.episodes))), *timing_tiles([log.episode for log in logs])]
     lead = f"The policy on {_beside(deployed)}."
-    figure = largest_difference(episodes, [row.column for row in deployed.replay], units, "deploy-worst")
+    figure = largest_difference(episodes, [row.field for row in deployed.replay], units, "deploy-worst")
     # Tables come after all figures and sentences.
     blocks = sorted(blocks, key=lambda block: isinstance(block, TableBlock | FoldBlock))
     return PageSection("deploy", "Deploy", lead, tiles, [*blocks, *about(artifact)], _deploy_banner(deployed), figure)
@@ -283,7 +283,7 @@ def _deploy_banner(deployed: Deployment) -> Banner | None:
         return _DRY if deployed.dry_run else None
     joint = f": {verdict.reasons[0].about}" if verdict.status == "look at this joint" else ""
     title = f"{verdict.status[:1].upper()}{verdict.status[1:]}{joint}"
-    reasons = [sentence(reason, [row.name for row in deployed.replay]) for reason in deployed.reasons]
+    reasons = [sentence(reason, [row.joint for row in deployed.replay]) for reason in deployed.reasons]
     reasons[1:1] = [f"next: {verdict.next}"] if verdict.next else []
     return Banner(_DEPLOYED.get(verdict.status, "doubt"), title, reasons)
 
@@ -378,7 +378,7 @@ def _deploy_tables(deployed: Deployment) -> list[Block]:
             "The recorded commands, played again on models: root mean square error of each model's prediction, and the "
             "expected error of the identification."
         )
-        blocks.append(TableBlock.of(caption, compared_table(deployed.replay, "log")))
+        blocks.append(TableBlock.of(caption, compared_table(deployed.replay)))
     return blocks
 
 

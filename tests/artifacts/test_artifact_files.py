@@ -243,13 +243,18 @@ DAMAGE = [
     (TIMED, "timing.json", {"nodes": {}}, "nodes"),
     (DRAWN, "episodes.json", {"format": 99}, "format 99"),
     (DRAWN, "episodes.json", {"parameters": []}, "other parameters"),
-    (DRAWN, "episodes.json", {"noise": [{"column": "q", "unit": "", "deviation": -1, "quantum": 0, "bias": 0}]}, "q"),
+    (
+        DRAWN,
+        "episodes.json",
+        {"noise": [{"field": "q", "unit": "", "deviation": -1, "resolution": 0, "offset": 0}]},
+        "q",
+    ),
 ]
 DAMAGE_OF_POSTERIORS = [
     ({"mean": "much"}, "convert"),
     ({"covariance": [[1.0, 0.0], [0.0]]}, "inhomogeneous"),
     ({"names": None}, "array"),
-    ({"low": [0.0, 1.0]}, "sizes"),
+    ({"lower": [0.0, 1.0]}, "sizes"),
     ({"transform": ["cubic"]}, "cubic"),
     ({"mean": [None]}, "number"),
 ]

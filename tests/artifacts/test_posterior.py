@@ -1,9 +1,10 @@
 """The posterior: what is drawn from it, and what its file takes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from sim2real.artifacts.posterior import Posterior
 from sim2real.identification.parameters import Parameter, ParameterTable
 
 
@@ -45,9 +46,7 @@ def test_draws_stay_within_the_bounds(posterior):
 
 
 def test_a_direction_without_spread_is_no_problem(posterior):
-    flat = Posterior(
-        posterior.names, posterior.transform, posterior.mean, np.diag([0.0, 0.04, 0.0]), posterior.low, posterior.high
-    )
+    flat = replace(posterior, covariance=np.diag([0.0, 0.04, 0.0]))
     drawn = flat.sample(np.random.default_rng(0), 100)
     np.testing.assert_allclose(drawn["gain"], 3.0, rtol=1e-6)
     assert drawn["offset"].std() == pytest.approx(0.2, rel=0.3)

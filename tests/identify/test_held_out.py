@@ -60,7 +60,7 @@ def test_fewer_parameters_are_estimated_as_by_a_table_that_holds_the_others(one)
 
 
 def test_blocks_cover_the_log_without_overlap(one):
-    ends = [(begin, end) for part in one.parts for _, begin, end in part.parts]
+    ends = [(begin, end) for part in one.parts for _, begin, end in part.stretches]
     assert ends[0][0] == pytest.approx(0.4)
     assert all(a[1] == pytest.approx(b[0]) for a, b in pairwise(ends))
     masks = np.array([p.touches(spans(0), LENGTH_S) for p in one.parts])
@@ -116,8 +116,8 @@ def test_groups_of_parts_cover_all_of_them_and_few_parts_stay_alone():
     parts = [Fold(f"p{i}", ((i, 0.0, np.inf),)) for i in range(29)]
     groups, of = held_out.shared(parts)
     assert len(groups) == held_out.MOST
-    assert all(part.parts[0] in groups[g].parts for part, g in zip(parts, of, strict=True))
-    assert sum(len(g.parts) for g in groups) == len(parts)
+    assert all(part.stretches[0] in groups[g].stretches for part, g in zip(parts, of, strict=True))
+    assert sum(len(g.stretches) for g in groups) == len(parts)
     groups, of = held_out.shared(parts[: held_out.MOST])
     assert groups == parts[: held_out.MOST]
     assert of.tolist() == list(range(held_out.MOST))
@@ -134,8 +134,8 @@ def test_too_few_recordings_are_divided_into_blocks(three):
     for names, least in ((["a", "b", "c"], 4), (["all", "all", "all"], 2)):
         found = folds_of(whole.problem, 5, names, least)
         assert len(found) == 6  # two of each recording: five at least
-        assert [f.parts[0][0] for f in found] == [0, 0, 1, 1, 2, 2]
-        assert all(a.parts[0][2] == b.parts[0][1] for a, b in zip(found[::2], found[1::2], strict=True))
+        assert [f.stretches[0][0] for f in found] == [0, 0, 1, 1, 2, 2]
+        assert all(a.stretches[0][2] == b.stretches[0][1] for a, b in zip(found[::2], found[1::2], strict=True))
     assert found[0].name.startswith("all, 0 to ")
 
 
@@ -146,7 +146,7 @@ def test_blocks_begin_where_segments_may(count, blocks, begin_s):
     begun = [Span(0, begin_s + 0.7 * i) for i in range(count)]
     problem = SimpleNamespace(spans=begun, train=np.arange(count), segment_s=0.7)
     found = folds_of(problem, blocks)
-    edges = [f.parts[0][1:] for f in found]
+    edges = [f.stretches[0][1:] for f in found]
     assert edges[0][0] == begin_s
     assert edges[-1][1] == pytest.approx(begin_s + 0.7 * count)
     inner = np.array([end for _, end in edges[:-1]])

@@ -50,7 +50,7 @@ def test_the_nominal_model_without_delays_is_much_worse(fitted):
     assert rmse["identified"] < 0.03
     assert rmse["nominal"] > 5 * rmse["identified"]
     assert rmse["no_delays"] > 2 * rmse["identified"]
-    assert rmse["hold"] > 5 * rmse["identified"]
+    assert rmse["standing still"] > 5 * rmse["identified"]
 
 
 def check_measurements(fitted, columns):

@@ -133,7 +133,7 @@ def test_what_repeats_at_rest_is_no_loss():
 def test_a_problem_knows_its_links(fitted):
     (link,) = links(fitted.problem, fitted.found.x)
     delay_s = fitted.truth["sensor_delay"] + fitted.truth["actuator_delay"]
-    assert link.parts == ("sensor_delay", "actuator_delay")
+    assert link.name == "sensor_delay + actuator_delay"
     assert link.mean.value == pytest.approx(delay_s, abs=0.5e-3)
     assert link.deviation.value < 0.7e-3
 
@@ -146,8 +146,7 @@ def test_without_a_delay_of_the_measurements_there_is_no_link(fitted):
 def test_links_are_kept_and_shown(tmp_path, capsys):
     number = Ranged(0.012, 0.01, 0.014)
     link = Link(
-        "late",
-        ("late", "commands"),
+        "late + commands",
         number,
         number,
         number,
@@ -158,7 +157,7 @@ def test_links_are_kept_and_shown(tmp_path, capsys):
     found = Identification("robot", (), Judgement("accepted", ()), (), links=(link,))
     found.save(tmp_path)
     (kept,) = Identification.load(tmp_path).links
-    assert (kept.mean, kept.parts) == (link.mean, link.parts)
+    assert (kept.mean, kept.name) == (link.mean, link.name)
     assert kept.share == pytest.approx(link.share)
     show(found)
     assert "late + commands, mean" in capsys.readouterr().out

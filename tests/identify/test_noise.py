@@ -14,7 +14,7 @@ SEGMENTS, LENGTH = 60, 80
 TABLE = ParameterTable([Parameter("gain", "1", 1.0, 0.1, 10.0), Parameter("offset", "1", 1.0, 0.1, 10.0)])
 
 
-def columns(deviation=DEVIATION, bias=BIAS, quantum=QUANTUM, slow=0.0):
+def columns(deviation=DEVIATION, bias=BIAS, resolution=QUANTUM, slow=0.0):
     """Return segments of a sine: the model is it, the sensor scatters, and the model drifts off by ``slow``."""
     rng = np.random.default_rng(0)
     t = np.arange(LENGTH) * 0.02
@@ -23,7 +23,7 @@ def columns(deviation=DEVIATION, bias=BIAS, quantum=QUANTUM, slow=0.0):
         truth = np.sin(3 * t + s)
         read = truth + slow * np.sin(2 * t + rng.uniform(0, 6)) + bias * rng.standard_normal()
         read = read + deviation * rng.standard_normal(LENGTH)
-        read = np.round(read / quantum) * quantum if quantum else read
+        read = np.round(read / resolution) * resolution if resolution else read
         parts.append((np.full(LENGTH, float(s)), read, truth))
     segment, measured, model = (np.concatenate(p) for p in zip(*parts, strict=True))
     return {"segment": segment, "q[1]_measured": measured, "q[1]_identified": model}
@@ -31,15 +31,15 @@ def columns(deviation=DEVIATION, bias=BIAS, quantum=QUANTUM, slow=0.0):
 
 def test_white_noise_rounding_and_bias_are_told_apart():
     (found,) = noises(columns(), {"q": "rad"})
-    assert (found.column, found.unit, found.place) == ("q[1]", "rad", ("q", 1))
-    assert found.quantum == pytest.approx(QUANTUM, rel=1e-6)
+    assert (found.field, found.unit, found.place) == ("q[1]", "rad", ("q", 1))
+    assert found.resolution == pytest.approx(QUANTUM, rel=1e-6)
     assert found.deviation == pytest.approx(DEVIATION, rel=0.05)
-    assert found.bias == pytest.approx(BIAS, rel=0.3)
+    assert found.offset == pytest.approx(BIAS, rel=0.3)
 
 
 def test_an_exact_sensor_has_no_noise():
     (found,) = noises(columns(0.0, 0.0, 0.0), {})
-    assert (found.deviation, found.quantum, found.bias, found.unit) == (0.0, 0.0, 0.0, "")
+    assert (found.deviation, found.resolution, found.offset, found.unit) == (0.0, 0.0, 0.0, "")
 
 
 def test_errors_of_the_model_are_no_noise():

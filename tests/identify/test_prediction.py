@@ -46,8 +46,9 @@ def test_columns_are_named_by_field_and_index(problem):
 
 def errors_at(columns, horizon_s):
     """Return model -> error of each position up to a horizon."""
+    column_of = {p.name: p.column for p in POSITIONS}
     rows = errors(columns, ["model"], POSITIONS, SETTLE_S, horizon_s)
-    return {row.column: {"model": row.error, **row.baselines} for row in rows}
+    return {column_of[row.joint]: {"model": row.error, **row.baselines} for row in rows}
 
 
 def test_errors_count_from_the_end_of_settling_to_the_horizon(columns):
@@ -57,20 +58,20 @@ def test_errors_count_from_the_end_of_settling_to_the_horizon(columns):
     assert long["q[2]"]["model"] == pytest.approx(long["th"]["model"])
 
 
-def test_holding_still_says_what_was_measured_last(columns):
+def test_standing_still_says_what_was_measured_last(columns):
     # The last measurement before the horizon is the one at 0.2 s, 2: then 3 and 4 come.
-    assert errors_at(columns, 0.2001)["th"]["hold"] == pytest.approx(np.sqrt((1 + 4) / 2))
+    assert errors_at(columns, 0.2001)["th"]["standing still"] == pytest.approx(np.sqrt((1 + 4) / 2))
 
 
 def test_no_samples_no_number(columns):
     assert errors_at({n: c[~columns["held_out"]] for n, c in columns.items()}, 0.3) == {}
 
 
-def test_told_is_where_a_joint_was_told_to_be(columns):
-    columns = {**columns, "q[2]_told": columns["q[2]_measured"] + np.where(columns["into"] > 0.45, 0.3, 0.1)}
+def test_the_goal_is_where_a_joint_shall_be(columns):
+    columns = {**columns, "q[2]_goal": columns["q[2]_measured"] + np.where(columns["into"] > 0.45, 0.3, 0.1)}
     found = errors_at(columns, 0.2001)
-    assert found["q[2]"]["told"] == pytest.approx(0.1)
-    assert "told" not in found["th"]
+    assert found["q[2]"]["goal"] == pytest.approx(0.1)
+    assert "goal" not in found["th"]
 
 
 @pytest.mark.parametrize(("resonance_hz", "found"), [(15.0, True), (8.0, True), (None, False)])

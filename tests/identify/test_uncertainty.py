@@ -292,8 +292,7 @@ def test_each_recording_alone_is_a_linear_step_from_all(monkeypatch):
     problem = stub(table)
     (row,) = uncertainty.compare_recordings(problem, at)
     assert row.mean == pytest.approx(0.0, abs=0.02)
-    assert row.between == pytest.approx(0.5, abs=0.03)  # the deviation of 0.5, -0.5 and 0
-    assert not row.agree
+    assert row.spread == pytest.approx(0.5, abs=0.03)  # the deviation of 0.5, -0.5 and 0
     assert row.low95 < -1.0
     bounded = table_of(Parameter("a", "1", 0.0, -1.0, 9.0, "linear"))
     (row,) = uncertainty.compare_recordings(stub(bounded), at)

@@ -1,7 +1,6 @@
 """The worst second: of which joint, when, and against which size."""
 
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +9,7 @@ from sim2real.artifacts.identification import with_small_unit, worst_window
 from sim2real.identification.predictions import Position, worst_second
 
 LARGE, SMALL = Position("q[0]", "hip", "rad", 0.001), Position("q[1]", "wrist", "rad", 0.001)
+LOGS = ("a.mcap", "b.mcap")
 
 
 def samples(errors):
@@ -44,16 +44,19 @@ def pulse(begin_s, size, long_s=0.5):
     ids=["large", "small", "as a share of the motion", "all is noise", "the fitted beginning of a held-out segment"],
 )
 def test_the_worst_joint_and_its_second(errors, name, around_s):
-    worst = worst_second(samples(errors), (LARGE, SMALL), settle_s=0.3)
-    assert worst.name == name
+    columns = samples(errors)
+    worst, inside = worst_second(columns, (LARGE, SMALL), 0.3, LOGS)
+    assert worst.joint == name
+    t = columns["t"][inside]
+    assert (t[0], t[-1]) == (worst.begin_s, worst.end_s)
     assert worst.begin_s <= around_s <= worst.end_s
     assert worst.end_s - worst.begin_s == pytest.approx(1.0, abs=0.02)
 
 
 def test_a_model_that_diverges_is_the_worst():
-    worst = worst_second(samples((pulse(3.0, 5.0), pulse(4.3, math.nan))), (LARGE, SMALL), 0.3)
-    assert (worst.name, worst.rmse, worst.error) == ("wrist", None, "the model diverges")
-    assert worst_second({}, (LARGE,), 0.3) is None
+    worst, _ = worst_second(samples((pulse(3.0, 5.0), pulse(4.3, math.nan))), (LARGE, SMALL), 0.3, LOGS)
+    assert (worst.joint, worst.error, worst.unexplained) == ("wrist", None, True)
+    assert worst_second({}, (LARGE,), 0.3, LOGS) is None
 
 
 def test_a_series_shorter_than_a_second_is_one_window():
@@ -61,10 +64,8 @@ def test_a_series_shorter_than_a_second_is_one_window():
 
 
 def test_its_line_has_joint_time_and_error():
-    worst = worst_second(samples((pulse(3.0, 0.2), still)), (LARGE, SMALL), 0.3)
-    logs = [SimpleNamespace(path=path) for path in ("record/a.mcap", "record/b.mcap")]
-    assert worst.text(logs[:1]) == f"joint hip, {worst.begin_s:.1f} s, {1e3 * worst.rmse:.0f} mrad"
-    assert " s of a.mcap, " in worst.text(logs)
+    worst, _ = worst_second(samples((pulse(3.0, 0.2), still)), (LARGE, SMALL), 0.3, LOGS)
+    assert str(worst) == f"joint hip, {worst.begin_s:.1f} s of a.mcap, {1e3 * worst.error:.0f} mrad"
 
 
 @pytest.mark.parametrize(

@@ -106,7 +106,7 @@ def test_a_run_records_identifies_and_deploys_the_shipped_policy(tmp_path, capsy
     found = Identification.load(run / "identify")
     assert found.verdict.status == "accepted"
     assert "not determined by this log: foot_friction, payload, roughness" in found.verdict.reasons
-    names = [p for p in found.parameters if p.kind == "dynamics" and p.verdict != "fixed"]
+    names = [p for p in found.parameters if p.kind == "dynamics" and p.state != "fixed"]
     assert len(names) == 21
     for p in names:
         assert p.estimate == pytest.approx(p.truth, rel=0.2), p.name  # of 6 s, on a busy machine

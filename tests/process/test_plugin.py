@@ -99,7 +99,7 @@ def test_it_is_recorded_by_its_device(log):
 def test_it_is_identified_in_a_world_of_its_own(call, log):
     call("-c", IDENTIFY.format(log=str(log)))
     found = Identification.load(call.folder / "found")
-    assert (found.pipeline, found.world) == ("turntable", "oiled")
+    assert (found.pipeline, found.internal.world) == ("turntable", "oiled")
     by_name = {p.name: p for p in found.parameters}
     assert {"loop", "friction", "drag", "round_trip_delay"} <= set(by_name)
     loop = by_name["loop"]

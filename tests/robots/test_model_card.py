@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sim2real import cli, errors
-from sim2real.artifacts.identification import AHEAD, HELD_OUT, ComparedError, Estimate, Identification, Judgement
+from sim2real.artifacts.identification import ComparedError, Estimate, Identification, Internal, Judgement
 from sim2real.artifacts.posterior import Posterior
 from sim2real.graph.episode import Episode, Steps
 from sim2real.identification import predictions as prediction
@@ -67,8 +67,8 @@ def known(robot, episode, values, begins_s):
         Identification("any", (), Judgement("accepted", ()), tuple(rows)),
         samples=columns,
         free=free,
-        settle_s=SETTLE_S,
-        errors=tuple(ComparedError(HELD_OUT, "th", "th", "", AHEAD, s, 0.0) for s in (0.1, 1.0)),
+        internal=Internal(settle_s=SETTLE_S),
+        errors=tuple(ComparedError("", "th", "", s, 0.0) for s in (0.1, 1.0)),
         replays=replays(problem, values, SETTLE_S, "ahead") | replays(long, values, SETTLE_S, "free"),
         units=robot.units,
     )

@@ -105,7 +105,7 @@ def test_a_bias_stays_for_an_episode(noisy):
 def test_a_share_of_the_noise_is_that_share_of_its_errors(noisy):
     sensor, _ = noisy
     sensor = copy.copy(sensor)
-    sensor.noise = tuple(dataclasses.replace(n, quantum=0.0) for n in sensor.noise)
+    sensor.noise = tuple(dataclasses.replace(n, resolution=0.0) for n in sensor.noise)
     still = heard("world", JointReading(jnp.array([1.0, 2.0]), jnp.array([3.0, 4.0])))
 
     def off(share):

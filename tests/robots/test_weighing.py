@@ -73,7 +73,7 @@ def test_the_load_has_an_interval_and_training_draws_it_beside_the_strengths(sta
     before = identified(values)
     found = weighing.weighed(ROBOT, before, episode, {"payload": load})
     row = found.parameters[-1]
-    assert (row.name, row.unit, row.verdict, row.truth) == ("payload", "kg", "ok", load)
+    assert (row.name, row.unit, row.state, row.truth) == ("payload", "kg", "ok", load)
     assert row.low95 < load < row.high95
     assert 0.03 < row.high95 - row.low95 < 0.6
     assert found.posterior.names == (*before.posterior.names, "payload")

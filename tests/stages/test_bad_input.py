@@ -5,6 +5,7 @@ import json
 import pytest
 
 from sim2real import cli, errors
+from sim2real.artifacts.identification import FORMAT
 
 
 @pytest.fixture
@@ -134,7 +135,7 @@ def test_damaged_parameters(fails, tmp_path, finished_run_dir):
 
     for text in ("", "{", "[]", "{}", '{"parameters": 3, "pipeline": "pendulum", "log": {"path": "x"}}'):
         assert "is malformed" in damaged(text)
-    assert "format 2, this version reads 5" in damaged(json.dumps({**good, "format": 2}))
+    assert f"format 2, this version reads {FORMAT}" in damaged(json.dumps({**good, "format": 2}))
     assert "of pipeline 'arm'" in damaged(json.dumps({**good, "pipeline": "arm"}))
     assert "damping" in damaged(
         json.dumps({**good, "parameters": [p for p in good["parameters"] if p["name"] != "damping"]})

@@ -10,7 +10,7 @@ import pytest
 
 from sim2real import cli, errors
 from sim2real.artifacts import run as run_folder
-from sim2real.artifacts.identification import Estimate, Identification, Judgement
+from sim2real.artifacts.identification import Estimate, Identification, Internal, Judgement
 from sim2real.artifacts.posterior import Posterior
 from sim2real.identification.export import terms
 from sim2real.stages.load import load_robot
@@ -136,6 +136,6 @@ def test_what_is_not_there_is_said(here, capsys, arguments, words):
 
 
 def test_parameters_of_a_world_that_is_not_installed_are_refused(arm, here, capsys):
-    file = save(replace(arm, world="nowhere"), here / "found")
+    file = save(replace(arm, internal=Internal(world="nowhere")), here / "found")
     assert cli.main(["export", str(file)]) == errors.USAGE
     assert "nowhere" in capsys.readouterr().err

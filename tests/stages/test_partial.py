@@ -59,7 +59,7 @@ def test_the_best_so_far_is_left_and_says_what_it_is(pendulum, tmp_path, monkeyp
     assert "75% of search" in document["verdict"]["reasons"][0]
     rows = {p["name"]: p for p in document["parameters"]}
     assert rows["gain"]["estimate"] == pytest.approx(21.0, rel=1e-4)
-    assert rows["gain"]["verdict"] == "not determined"
+    assert rows["gain"]["state"] == "not determined"
     with pytest.raises(Sim2RealError, match="did not finish"):
         open_identification(path, pendulum)
 

@@ -7,12 +7,11 @@ from pathlib import Path
 import pytest
 
 from sim2real.artifacts.identification import (
-    AHEAD,
-    FREE_RUN,
     ComparedError,
     Estimate,
     ExpectedError,
     Identification,
+    Internal,
     Judgement,
 )
 from sim2real.artifacts.recording import Recording
@@ -28,8 +27,8 @@ ROOT = Path(__file__).parents[2]
 LOGS = [ROOT / "datasets" / "pendulum" / f"{name}.mcap" for name in ("chirp", "multisine")]
 
 
-def error(log="b.mcap", size=0.004, expected=0.02, kind=AHEAD, **changes):
-    row = ComparedError(log, "q", "elbow", "rad", kind, 8.0, size, expected, baselines={"hold": 0.2})
+def error(log="b.mcap", size=0.004, expected=0.02, free_run=False, **changes):
+    row = ComparedError(log, "elbow", "rad", 8.0, size, free_run, expected, baselines={"standing still": 0.2})
     return replace(row, **changes)
 
 
@@ -38,11 +37,11 @@ def error(log="b.mcap", size=0.004, expected=0.02, kind=AHEAD, **changes):
     [
         ([error()], {}, True, "this log"),
         ([error(), error("c.mcap")], {}, True, "2 logs"),
-        ([error(size=0.0249)], {}, True, "this log"),
+        ([error(size=0.0199)], {}, True, "this log"),
         ([error(size=0.031)], {}, False, "1.55"),
         ([error(size=None)], {}, False, "diverges"),
-        ([error()] * 99 + [error("bad.mcap", 0.031, kind=FREE_RUN)], {}, False, "bad.mcap"),
-        ([error(beaten_by=("hold",))], {}, False, "hold"),
+        ([error()] * 99 + [error("bad.mcap", 0.031, free_run=True)], {}, False, "bad.mcap"),
+        ([error(as_good=("standing still",))], {}, False, "standing still"),
         ([error()], {"refused": {"a.mcap": "it lasts 0.1 s"}}, False, "a.mcap"),
         ([error(expected=None)], {}, True, "expects no error"),
     ],
@@ -77,9 +76,14 @@ def identification(upper_s=0.06, world=None, expected=1.0, horizon_s=1.0):
                  upper=2 * upper_s if p.name == "actuator_delay" else p.high)
         for p in pipeline.identifiable(0.06).parameters
     )  # fmt: skip
-    error = (ExpectedError("th", "th", "rad", AHEAD, horizon_s, expected),)
+    error = (ExpectedError("hinge", "rad", horizon_s, expected),)
     return pipeline, Identification(
-        "pendulum", (), Judgement("accepted", ()), parameters, expected_error=error, settle_s=0.3, world=world
+        "pendulum",
+        (),
+        Judgement("accepted", ()),
+        parameters,
+        expected_error=error,
+        internal=Internal(settle_s=0.3, world=world),
     )
 
 
@@ -95,15 +99,17 @@ def test_each_log_is_scored_alone_and_a_bad_one_does_not_stop_the_others():
     pipeline, found = identification(expected=1e-6)
     good, short = (open_recording(path, pipeline) for path in LOGS)
     lacking = Recording(Path("lacking.mcap"), replace(short.episode, steps={}, outputs={}))
-    found = replace(found, expected_error=(*found.expected_error, ExpectedError("th", "th", "rad", FREE_RUN, 2.0, 1.0)))
+    found = replace(
+        found, expected_error=(*found.expected_error, ExpectedError("hinge", "rad", 2.0, 1.0, free_run=True))
+    )
     scored = stage.score(found, pipeline, [good, lacking, short], {"unreadable.csv": "no columns"})
     assert set(scored.refused) == {"lacking.mcap", "unreadable.csv"}
-    ahead = {e.source: e for e in scored.errors if e.kind == AHEAD}
+    ahead = {e.log: e for e in scored.errors if not e.free_run}
     assert set(ahead) == {good.path.name, short.path.name}
     assert all(e.ratio == pytest.approx(e.error / 1e-6) for e in ahead.values())
-    assert {e.seconds for e in scored.errors if e.kind == FREE_RUN} == {2.0}
+    assert {e.seconds for e in scored.errors if e.free_run} == {2.0}
     assert not scored.holds
-    (alone,) = [e for e in stage.score(found, pipeline, [good]).errors if e.kind == AHEAD]
+    (alone,) = [e for e in stage.score(found, pipeline, [good]).errors if not e.free_run]
     assert alone.error == pytest.approx(ahead[good.path.name].error, rel=0.02)  # programs of other sizes
     with pytest.raises(UsageError, match="lacking"):
         stage.score(found, pipeline, [lacking])

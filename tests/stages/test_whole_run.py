@@ -92,7 +92,7 @@ def test_training_on_what_is_not_accepted_must_be_asked_for(finished_run_dir, tm
     file = run_dir / "identify" / "parameters.json"
     document = json.loads(file.read_text())
     document["verdict"] = {"status": "change the model", "reasons": ["friction is at its bound"], "next": "widen it"}
-    document["parameters"][0]["verdict"] = "not determined"
+    document["parameters"][0]["state"] = "not determined"
     file.write_text(json.dumps(document))
     home = ["train", "pendulum", "--run", str(run_dir), "--runs", str(tmp_path), "--timelines=4", "--explain"]
     assert cli.main(home) == 1
@@ -107,7 +107,7 @@ def test_training_on_what_is_not_accepted_must_be_asked_for(finished_run_dir, tm
     assert "left open by the log" in shown.out
     assert (run_dir / "explain" / "episodes.npz").is_file()
     drawn = Episodes.load(run_dir / "explain")
-    assert (drawn.timelines, {n.column for n in drawn.noise}) == (4, {"th", "thdot"})
+    assert (drawn.timelines, {n.field for n in drawn.noise}) == (4, {"th", "thdot"})
     assert not (run_dir / "train.2").exists()
 
 
@@ -125,7 +125,7 @@ def test_what_the_page_for_notebooks_has_runs(finished_run_dir, tmp_path, monkey
     assert (tmp_path / "notebook" / "session.mcap").is_file()
     assert recording.units["th"] == "rad"
     assert found.values.keys() == sim2real.Identification.load(finished_run_dir / "identify").values.keys()
-    assert (found.pipeline, found.world) == ("pendulum", None)
+    assert (found.pipeline, found.internal.world) == ("pendulum", None)
     assert found.timing.nodes["sensor"].steps == len(recording.episode.steps["sensor"])
     recorded = manifest_of(finished_run_dir / "record")["outputs"]["log"]
     assert [vars(log) for log in found.logs] == [{"path": "session.mcap", "sha256": recorded["sha256"]}]

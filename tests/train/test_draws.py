@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sim2real.artifacts.identification import Estimate, Identification, Judgement, Quantity
+from sim2real.artifacts.identification import Estimate, Identification, Judgement, OverLogs
 from sim2real.artifacts.posterior import Posterior
 from sim2real.errors import UsageError
 from sim2real.training.environment.draws import COUNT, draw_robots, widen_posterior, without_default_ranges
@@ -34,8 +34,7 @@ def found():
         parameters=tuple(
             Estimate(n, "1", kind, "", 1.0, values[n], "accepted") for n, kind in zip(NAMES, KINDS, strict=True)
         ),
-        posterior=Posterior(NAMES, transform, mean, covariance, low, high),
-        widening=3.0,
+        posterior=Posterior(NAMES, transform, mean, covariance, low, high, widening=3.0),
     )
 
 
@@ -75,10 +74,10 @@ def test_what_the_model_leaves_unexplained_widens_the_draws(found, options, rand
 
 def test_what_differs_between_recordings_widens_them_too(found):
     both = tuple(
-        Quantity(n, "1", mean, 0.0, between, 0.0, 1.0, False)
+        OverLogs(n, "1", mean, 0.0, between, 0.0, 1.0)
         for n, mean, between in (("gain", 20.0, 0.4), ("actuator_delay", 0.045, 0.002))
     )
-    draws = drawn(replace(found, aggregate=both), misfit=False)
+    draws = drawn(replace(found, over_logs=both), misfit=False)
     assert np.log(draws["gain"]).std() == pytest.approx(np.hypot(0.005, 0.4 / 20.0), rel=0.1)
     assert draws["actuator_delay"].std() == pytest.approx(np.hypot(SUM_S, 0.002), rel=0.1)
 
@@ -89,7 +88,7 @@ def test_a_parameter_that_is_open_is_drawn_from_all_of_its_bounds(found):
     covariance[0, 0] = (2.0 / np.sqrt(12.0)) ** 2
     covariance[0, 1] = covariance[1, 0] = 0.0
     scale = np.log(drawn(replace(found, posterior=replace(posterior, covariance=covariance)))["gain"])
-    low, high = posterior.low[0], posterior.high[0]
+    low, high = posterior.lower[0], posterior.upper[0]
     assert low <= scale.min() < scale.max() <= high
     shares = np.histogram(scale, 4, (low, high))[0] / COUNT
     assert shares.min() > 0.18, "no heap at a bound"

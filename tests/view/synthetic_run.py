@@ -86,7 +86,7 @@ def entry(
         "name": name, "unit": unit, "kind": kind, "about": f"about {name}", "nominal": nominal,
         "estimate": estimate, "standard_error": se, "low95": low, "high95": high,
         "lower": 0.0 if kind != "dynamics" else nominal / 4, "upper": 0.06 if unit == "s" else nominal * 4,
-        "verdict": "ok", "truth": truth,
+        "state": "ok", "truth": truth,
     }  # fmt: skip
 
 
@@ -94,7 +94,7 @@ def parameters(truth: bool = True) -> dict[str, Any]:
     """Return parameters.json; ``truth``: with the true values, as of an emulated robot."""
     names = [EVIL, "friction", "sensor_delay"]
     return {
-        "format": 5,
+        "format": 6,
         "pipeline": "pendulum",
         "logs": [{"path": "../record/session.mcap", "sha256": "0" * 64}],
         "verdict": {"status": "change the model", "reasons": ["at a bound: friction", "sensor_delay is <b>loose</b>"]},
@@ -105,30 +105,29 @@ def parameters(truth: bool = True) -> dict[str, Any]:
             entry("round_trip_delay", "s", "derived", 0.0448, 0.0001, 0.0, 0.0446 if truth else None),
         ],
         "posterior": {
-            "names": names, "transform": ["linear"] * 3, "mean": [0.0] * 3, "low": [-9.0] * 3, "high": [9.0] * 3,
+            "names": names, "transform": ["linear"] * 3, "mean": [0.0] * 3, "lower": [-9.0] * 3, "upper": [9.0] * 3,
             "covariance": (np.eye(3) * 0.5 + 0.5).tolist(),
         },
         "errors": [
             {
-                "source": "held-out data", "name": n, "column": f, "unit": "rad", "kind": "ahead", "seconds": 1.0,
-                "error": e, "beaten_by": b, "baselines": {"no delay": 0.2, "nominal": 0.58, "hold": None},
+                "log": "", "joint": n, "unit": "rad", "seconds": 1.0, "error": e, "as_good": g,
+                "baselines": {"without delays": 0.2, "nominal": 0.58, "standing still": None},
             }
-            for n, f, e, b in (("th", "th", 0.0234, ["no delay"]), (EVIL, "other", 0.0117, []))
+            for n, e, g in (("th", 0.0234, ["nominal"]), (EVIL, 0.0117, []))
         ],
         "worst": {
-            "name": "th", "column": "th", "unit": "rad", "recording": 0, "segment": 3, "begin_s": 3.0, "end_s": 3.98,
-            "rmse": 0.01, "of_motion": 0.1,
+            "joint": "th", "field": "th", "unit": "rad", "log": "session.mcap", "begin_s": 3.0, "end_s": 3.98,
+            "error": 0.01, "share_of_motion": 0.1,
         },
-        "aggregate": [],
         "units": UNITS,
     }  # fmt: skip
 
 
-def aggregate() -> list[dict[str, Any]]:
-    """Return two quantities over three recordings; the delays disagree."""
+def over_logs() -> list[dict[str, Any]]:
+    """Return two parameters over three logs."""
     rows = []
-    for name, unit, scale, agree in (("friction", "rad/s^2", 8.5, True), ("round_trip_delay", "s", 0.045, False)):
-        ends = {"mean": scale, "standard_error": 0.01 * scale, "between": 0.02 * scale, "agree": agree}
+    for name, unit, scale in (("friction", "rad/s^2", 8.5), ("round_trip_delay", "s", 0.045)):
+        ends = {"mean": scale, "standard_error": 0.01 * scale, "spread": 0.02 * scale}
         ends |= {"low95": 0.8 * scale, "high95": 1.2 * scale}
         rows.append({"name": name, "unit": unit, **ends})
     return rows
@@ -141,11 +140,11 @@ def predictions() -> dict[str, np.ndarray]:
     segment = np.repeat(np.arange(len(starts)), 50)
     values = {
         "t": t, "segment": segment, "held_out": segment >= 3, "recording": np.zeros(t.shape, int),
-        "into": t - np.array(starts)[segment],
+        "into": t - np.array(starts)[segment], "worst": segment == 3,
     }  # fmt: skip
     for field, true in (("th", np.sin(t)), ("thdot", np.cos(t))):
         values |= {f"{field}_measured": true, f"{field}_identified": true + 0.01, f"{field}_nominal": 1.3 * true}
-        values[f"{field}_no delay"] = 1.1 * true
+        values[f"{field}_without delays"] = 1.1 * true
     return values
 
 
@@ -158,7 +157,7 @@ def free_runs() -> dict[str, np.ndarray]:
         "held_out": np.ones(t.shape, bool),
     }  # fmt: skip
     for field, true in (("th", np.sin(t)), ("thdot", np.cos(t))):
-        values |= {f"{field}_measured": true, f"{field}_identified": true + 0.01, f"{field}_no delay": 30 * true}
+        values |= {f"{field}_measured": true, f"{field}_identified": true + 0.01, f"{field}_without delays": 30 * true}
     return values
 
 

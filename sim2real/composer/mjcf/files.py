@@ -73,15 +73,18 @@ def read(element: Element, file: str) -> Asset:
 def renamed_skin(asset: Asset, name: Callable[[str], str]) -> Asset:
     """Return a skin whose bones have other names."""
     contents = asset.contents
-    counts = struct.unpack("4i", contents[:16])
-    at = 16 + 4 * (3 * counts[0] + 2 * counts[1] + 3 * counts[2])
+    # The numbers of a file are of four bytes: four counts, then positions, texture coordinates and faces.
+    vertices, texcoords, faces, bones = struct.unpack("4i", contents[:16])
+    at = 16 + 4 * (3 * vertices + 2 * texcoords + 3 * faces)
     parts = [contents[:at]]
-    for _ in range(counts[3]):
+    # Each bone has a name, a position and an orientation, and its number of vertices, with an index and a weight each.
+    for _ in range(bones):
         new = name(contents[at : at + _NAME_BYTES].split(b"\0")[0].decode()).encode()
         if len(new) >= _NAME_BYTES:
             raise UsageError(f"the bone {new.decode()!r} of a skin has more than {_NAME_BYTES - 1} letters")
-        vertices = struct.unpack("i", contents[at + _NAME_BYTES + 28 : at + _NAME_BYTES + 32])[0]
-        end = at + _NAME_BYTES + 32 + 8 * vertices
+        pose_end = at + _NAME_BYTES + 4 * (3 + 4)
+        (count,) = struct.unpack("i", contents[pose_end : pose_end + 4])
+        end = pose_end + 4 + count * (4 + 4)
         parts += [new.ljust(_NAME_BYTES, b"\0"), contents[at + _NAME_BYTES : end]]
         at = end
     return Asset(b"".join(parts), asset.extension, asset.prefix)

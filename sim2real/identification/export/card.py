@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sim2real.artifacts.files import make_folder, write_arrays, write_json
-from sim2real.artifacts.identification import HELD_OUT
 from sim2real.identification.export.reproduce import Card
 from sim2real.identification.model import IdentifiableModel, PlainSimulation
 from sim2real.types import Json
@@ -34,7 +33,7 @@ RUNS = ("ahead", "free")
 """Held-out segments of the horizon's length, and free runs."""
 _COLUMNS = (
     *("name", "unit", "kind", "about", "estimate", "standard_error"),
-    *("low95", "high95", "lower", "upper", "verdict"),
+    *("low95", "high95", "lower", "upper", "state"),
 )
 _QUANTILES = {
     "times": (("q50", 0.5), ("q95", 0.95), ("q99", 0.99)),
@@ -156,7 +155,7 @@ def _held_out(identification: Identification, plain: PlainSimulation) -> dict[st
 
 
 def _figures(identification: Identification, signals: Mapping[str, np.ndarray]) -> Iterator[dict[str, Json]]:
-    """Yield errors on held-out data, up to each horizon and in free runs, then recorded times and ranges of motion."""
+    """Yield errors on held-out parts, up to each horizon and in free runs, then recorded times and ranges of motion."""
     units = identification.units
     for how, samples, pick, where in _runs(identification):
         for field in identification.fields:
@@ -175,14 +174,14 @@ def _figures(identification: Identification, signals: Mapping[str, np.ndarray]) 
 def _runs(
     identification: Identification,
 ) -> Iterator[tuple[str, Mapping[str, np.ndarray], np.ndarray, dict[str, Json]]]:
-    """Yield each kind of prediction of held-out data: how, its columns, the rows that count, and its recipe."""
+    """Yield each kind of prediction of held-out parts: how, its columns, the rows that count, and its recipe."""
     for run, samples in zip(RUNS, (identification.samples, identification.free), strict=True):
         if not samples:
             continue
-        ahead = samples["into"] - identification.settle_s
+        ahead = samples["into"] - identification.internal.settle_s
         counts = samples["held_out"].astype(bool) & (ahead > 0.0)
         if run == "ahead":
-            for horizon_s in sorted({row.seconds for row in identification.errors if row.source == HELD_OUT}):
+            for horizon_s in sorted({row.seconds for row in identification.errors if not row.log}):
                 how, where = f"up to {horizon_s:g} s ahead", {"run": run, "horizon_s": horizon_s}
                 yield how, samples, counts & (ahead <= horizon_s), where
             continue
@@ -201,11 +200,11 @@ def _unknown(identification: Identification) -> list[str]:
     """Return sentences about what the identification does not determine, and what its log does not cover."""
     sentences = []
     for p in identification.parameters:
-        if p.verdict == "fixed" and p.kind != "derived":
+        if p.state == "fixed" and p.kind != "derived":
             value = f"{p.estimate:.4g} {p.unit}".rstrip()
             sentences.append(f"{p.name} was not identified: it has its nominal value, {value}")
-        elif p.verdict != "ok" and p.kind != "derived":
-            sentences.append(f"{p.name} is {p.verdict}")
+        elif p.state != "ok" and p.kind != "derived":
+            sentences.append(f"{p.name} is {p.state}")
     return [*sentences, "outside of the motion, the speeds and the temperature of the log, the model extrapolates"]
 
 
@@ -226,7 +225,7 @@ def _simulation(identification: Identification, plain: PlainSimulation, model: I
         "command_delay_s": late["command"],
         # A world of the graph is busy for 0.999 of its tick: its message leaves that much earlier (BaseWorld).
         "measurement_delay_s": late["measurement"] - 0.001 * plain.tick_s,
-        "settle_s": identification.settle_s,
+        "settle_s": identification.internal.settle_s,
         "fields": fields,
     }
 

@@ -121,53 +121,61 @@ def verlet(model: Untyped, data: Untyped) -> None:
     data.qpos[:] = position + 0.5 * h * (before + data.qvel)
 
 
-def readings(xml: str, about: Untyped, signals: Arrays, kind: str, row: int, ts: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Simulate one segment; return what the encoders read at times ``ts``: positions and velocities ``(N, joints)``."""
+def readings(
+    xml: str, drives: Untyped, signals: Arrays, run: str, segment: int, ts: np.ndarray
+) -> tuple[np.ndarray, ...]:
+    """Simulate one segment; return what the encoders read at times ``ts``: positions and velocities ``(N, joints)``.
+
+    Args:
+        drives: The entry ``simulation`` of the card. ``law`` names the function of ``LAWS`` that drives joints, with
+            ``numbers``; commands act ``command_delay_s`` after they were sent, and the drive's ``lead_s`` later.
+        run: ``ahead`` or ``free``: the segments of which kind.
+    """
     model = _mj.MjModel.from_xml_string(xml)
-    data, law, memory = _mj.MjData(model), LAWS[about["law"]], {}
-    step = verlet if about["integrator"] == "verlet" else _mj.mj_step
-    tick_s, substeps = about["tick_s"], round(about["tick_s"] / model.opt.timestep)
+    data, law, memory = _mj.MjData(model), LAWS[drives["law"]], {}
+    step = verlet if drives["integrator"] == "verlet" else _mj.mj_step
+    tick_s, substeps = drives["tick_s"], round(drives["tick_s"] / model.opt.timestep)
     ticks = math.ceil(ts.max() / tick_s) + 2
-    prefix = f"{kind}/command/"
-    sent_s, delay_s = signals[f"{kind}/sent_s"][row], about["command_delay_s"] + about["lead_s"]
+    prefix = f"{run}/command/"
+    sent_s, delay_s = signals[f"{run}/sent_s"][segment], drives["command_delay_s"] + drives["lead_s"]
     commands = {
-        name.removeprefix(prefix): tick_means(sent_s, rows[row], delay_s, tick_s, ticks)
+        name.removeprefix(prefix): tick_means(sent_s, rows[segment], delay_s, tick_s, ticks)
         for name, rows in signals.items()
         if name.startswith(prefix)
     }
-    data.qpos[:], data.qvel[:] = signals[f"{kind}/qpos"][row], signals[f"{kind}/qvel"][row]
+    data.qpos[:], data.qvel[:] = signals[f"{run}/qpos"][segment], signals[f"{run}/qvel"][segment]
     _mj.mj_forward(model, data)
-    joints = [model.joint(name) for name in about["joints"]]
+    joints = [model.joint(name) for name in drives["joints"]]
     at, dof = [int(j.qposadr[0]) for j in joints], [int(j.dofadr[0]) for j in joints]
     moved = [(data.qpos[at].copy(), data.qvel[dof].copy())]
     for k in range(ticks):
         command = {name: rows[k] for name, rows in commands.items()}
         for _ in range(substeps):
-            law(model, data, about["numbers"], command, memory)
+            law(model, data, drives["numbers"], command, memory)
             step(model, data)
         # Velocities of a leapfrog are those of half a step before.
-        moved.append((data.qpos[at].copy(), data.qvel[dof] + about["velocity_lead_s"] * data.qacc[dof]))
-    read = ts - about["measurement_delay_s"]
+        moved.append((data.qpos[at].copy(), data.qvel[dof] + drives["velocity_lead_s"] * data.qacc[dof]))
+    read = ts - drives["measurement_delay_s"]
     position, speed = (
         np.stack([np.interp(read, tick_s * np.arange(ticks + 1), c) for c in np.array(rows).T], axis=1)
         for rows in zip(*moved, strict=True)
     )
-    e_cos, e_sin = (np.array(about["numbers"].get(n, 0.0)) for n in ("eccentric_cos", "eccentric_sin"))
+    e_cos, e_sin = (np.array(drives["numbers"].get(n, 0.0)) for n in ("eccentric_cos", "eccentric_sin"))
     reading = (
-        position + e_cos * np.cos(position) + e_sin * np.sin(position) + np.array(about["numbers"].get("zero", 0.0))
+        position + e_cos * np.cos(position) + e_sin * np.sin(position) + np.array(drives["numbers"].get("zero", 0.0))
     )
     return reading, speed * (1.0 - e_cos * np.sin(position) + e_sin * np.cos(position))
 
 
-def predictions(xml: str, about: Untyped, signals: Arrays, kind: str) -> dict[str, np.ndarray]:
+def predictions(xml: str, drives: Untyped, signals: Arrays, run: str) -> dict[str, np.ndarray]:
     """Return field -> error of the simulation ``(N,)`` at each measurement of the segments ``ahead`` or ``free``."""
-    rows, ts = signals[f"{kind}/row"], signals[f"{kind}/into"]
-    errors = {name: np.full(len(ts), np.nan) for name in about["fields"]}
-    for row in np.unique(rows):
-        pick = rows == row
-        both = readings(xml, about, signals, kind, int(row), ts[pick])
-        for name, (quantity, joint) in about["fields"].items():
-            errors[name][pick] = both[quantity][:, joint] - signals[f"{kind}/measured/{name}"][pick]
+    segments, ts = signals[f"{run}/row"], signals[f"{run}/into"]
+    errors = {name: np.full(len(ts), np.nan) for name in drives["fields"]}
+    for segment in np.unique(segments):
+        pick = segments == segment
+        both = readings(xml, drives, signals, run, int(segment), ts[pick])
+        for name, (quantity, joint) in drives["fields"].items():
+            errors[name][pick] = both[quantity][:, joint] - signals[f"{run}/measured/{name}"][pick]
     return errors
 
 

@@ -175,7 +175,7 @@ def _unexpressed(
     """Return the parameters without which the model would be the same, but for delays."""
     names = {p.name: p for p in found.parameters if p.kind not in ("delay", "derived")}
     # An optional term that is not part of the model sets no field.
-    names = {name: p for name, p in names.items() if p.verdict != "fixed" or p.estimate != p.nominal}
+    names = {name: p for name, p in names.items() if p.state != "fixed" or p.estimate != p.nominal}
     text = mjcf(best)
     return [
         name for name, p in names.items() if mjcf({**best, name: best[name] + 0.1 * (abs(best[name]) or 1.0)}) == text

@@ -193,6 +193,6 @@ def _with_load(
         transform=(*posterior.transform, "linear"),
         mean=np.append(posterior.mean, np.clip(load, *ends)),
         covariance=np.block([[covariance, cross[:, None]], [cross[None], slope @ cross + scatter**2]]),
-        low=np.append(posterior.low, ends[0]),
-        high=np.append(posterior.high, ends[1]),
+        lower=np.append(posterior.lower, ends[0]),
+        upper=np.append(posterior.upper, ends[1]),
     )

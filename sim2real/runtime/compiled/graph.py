@@ -168,14 +168,14 @@ class CompiledGraph:
         return gs.replace(eps=jnp.asarray(eps, jnp.int32), step=np.int32(0), seq={}, buffer=buffer, aux=aux)
 
     def reset(self, gs: GraphState) -> tuple[GraphState, StepState]:
-        """Run from the state of ``init`` to the supervisor's first step.
+        """Run from the state of ``init`` until the supervisor, usually the policy, is due for the first time.
 
         Returns:
             The graph's state, whose ``seq`` has the number of the supervisor's next step; and its step state.
         """
         self._check_row_start(gs, "reset")
         self._check_own_timelines("reset")
-        gs = self.program.run_slots(gs, 0, self._first_turn(), {})
+        gs = self.program.run_slots(gs, 0, self._first_slot(), {})
         arrived = self.program.seq(gs, self._turns[0]) >= 0
         return self._at_step(*self._play_on(gs, jnp.int32(0), arrived, int(self._places[:, 0].max())))
 
@@ -194,7 +194,7 @@ class CompiledGraph:
         Raises:
             UsageError: ``reset`` was not called, or the episode has no further step.
         """
-        self._first_turn()
+        self._first_slot()
         self._check_own_timelines("step")
         k = self._awaited(gs, "step")
         if not (_traced(k) or _traced(gs.eps)):
@@ -269,7 +269,7 @@ class CompiledGraph:
             UsageError: The supervisor makes several steps in one row.
         """
         self._check_row_start(gs, "observe")
-        turn = self._only_turn()
+        turn = self._only_slot()
         inside = inside or _is_checked(gs)
         gs = self.program.run_slots(gs, 0, turn, {}, inside)
         step_state = self.program.step_state(gs, turn, inside)
@@ -284,7 +284,7 @@ class CompiledGraph:
         Returns:
             The state at the start of the next row.
         """
-        turn, k = self._only_turn(), self._awaited(gs, "advance")
+        turn, k = self._only_slot(), self._awaited(gs, "advance")
         inside = inside or _is_checked(gs)
         ran = None if inside and self.program.always(turn) else k >= 0
         gs = self.program.commit(gs.replace(seq={}), self.supervisor, step_state, output, ran)
@@ -322,7 +322,7 @@ class CompiledGraph:
         """Return the number of the supervisor's steps in each episode, shape ``(E,)``."""
         return (self._places < self._behind).sum(axis=1)
 
-    def _first_turn(self) -> int:
+    def _first_slot(self) -> int:
         """Return the supervisor's first slot; raise a ``UsageError`` if it has none."""
         if self._turns:
             return self._turns[0]
@@ -331,9 +331,9 @@ class CompiledGraph:
             hint="make the node that acts the supervisor, or use rollout(), which works with any",
         )
 
-    def _only_turn(self) -> int:
+    def _only_slot(self) -> int:
         """Return the supervisor's only slot; raise a ``UsageError`` if it has none, or several."""
-        first = self._first_turn()
+        first = self._first_slot()
         if len(self._turns) > 1:
             raise UsageError(
                 f"the supervisor {self.supervisor!r} makes up to {len(self._turns)} steps in a row of these timelines",

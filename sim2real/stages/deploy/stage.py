@@ -88,7 +88,7 @@ def _deployed(
     from sim2real.stages.deploy.simulation import compare
     from sim2real.stages.deploy.verdict import judge
 
-    world = None if identification is None else identification.world
+    world = None if identification is None else identification.internal.world
     deployment = compare(in_world(robot, world), recordings, bundle, identification, config.duration_s)
     probe = Recording.load(folder / PROBE) if (folder / PROBE).is_file() else None
 
@@ -158,7 +158,7 @@ def _following(robot: Robot, identification: Identification) -> Following | None
 
 def _show(deployment: Deployment) -> None:
     """Print the gap to simulation, the tests of the model and the verdict of a deployment."""
-    tables = [deployment.rows(), compared_table(deployment.replay, "log")]
+    tables = [deployment.rows(), compared_table(deployment.replay)]
     tables += [] if deployment.drift is None else [deployment.drift.rows()]
     for content in tables:
         if content.rows:

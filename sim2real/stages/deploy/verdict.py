@@ -22,7 +22,7 @@ from sim2real.stages.shared.identification import command
 from sim2real.stages.terminal.console import progress
 from sim2real.stages.terminal.interruption import patiently
 
-_FAULTY_RATIO = 2.0
+_FAULTY_RATIO = 1.6
 """Ratio of the error to the expected one, with the parameters fitted to the deployment, above which a joint moves as no
 parameters explain."""
 _MAX_UNEXPLAINED = 0.5
@@ -89,8 +89,8 @@ def _no_comparison(d: Deployment) -> list[Reason]:
 
 def _unexplained(d: Deployment) -> list[Reason]:
     """Motion that no parameters explain, also those fitted to these logs: another identification would not help."""
-    fitted = {r.name: _ratio(as_here(r)) for r in d.replay}
-    left = {r.name: fitted[r.name] / max(_ratio(r), 1e-9) for r in d.replay}
+    fitted = {r.joint: _ratio(as_here(r)) for r in d.replay}
+    left = {r.joint: fitted[r.joint] / max(_ratio(r), 1e-9) for r in d.replay}
     faulty = [name for name in fitted if fitted[name] > _FAULTY_RATIO and not left[name] <= _MAX_UNEXPLAINED]
     return [Reason(Finding.UNEXPLAINED, max(faulty, key=lambda name: fitted[name]))] if faulty else []
 
@@ -108,7 +108,7 @@ def _changed(d: Deployment) -> list[Reason]:
 
 def _wrong(d: Deployment) -> list[Reason]:
     """Errors above the expected ones."""
-    wrong = [Reason(Finding.WRONG, r.name) for r in d.replay if r.exceeded]
+    wrong = [Reason(Finding.WRONG, r.joint) for r in d.replay if r.exceeded]
     likely = [Reason(Finding.LIKELY, d.drift.likely.name)] if d.drift and d.drift.likely else []
     return [*wrong, *likely] if wrong else []
 
@@ -220,12 +220,12 @@ def terms_to_identify(
     """
     if configured in ("auto", "all"):
         return configured
-    robot, max_delay_s = in_world(robot, identification.world), defaults_of(robot).identify.max_delay_s
+    robot, max_delay_s = in_world(robot, identification.internal.world), defaults_of(robot).identify.max_delay_s
     default = robot.identifiable(max_delay_s).parameters.terms
     changed = (drift.named or drift.likely) if drift is not None else None
     offered = {p.name: p.term for p in watched(robot, max_delay_s).parameters}
     added = offered.get(changed.name, "") if changed is not None else ""
-    before = default if identification.terms is None else identification.terms
+    before = default if (used := identification.used_terms) is None else used
     terms = (*before, added) if added and added not in before else before
     return configured if terms == default else ",".join(terms) or "none"
 

@@ -32,7 +32,7 @@ class IdentifyConfig(FitConfig):
     held_out: float = 0.25
     """Share of each log, at its end, that is held out; 0 if whole logs are held out."""
     free_run_s: float = 10.0
-    """Longest simulation of held-out data from a single initial state [s]."""
+    """Longest simulation of a held-out part from a single initial state [s]."""
     folds: int = 5
     """Parts that are held out of a refit, one at a time, to measure errors on new data: each of several logs, or this
     many blocks of a single log; 0 skips the refits."""
@@ -55,7 +55,7 @@ class IdentifyConfig(FitConfig):
             raise UsageError(f"held_out must lie in [0, 0.8], got {self.held_out}")
         if self.held_out == 0.0 and not self.hold_out:
             raise UsageError(
-                "held_out is 0 and no log is held out: held-out data must check an identification",
+                "held_out is 0 and no log is held out: a held-out part must check an identification",
                 hint="set --held-out to a share of the log, or name a log with --hold-out",
             )
         if not (0.0 <= self.settle_s <= 10.0 and 0.2 <= self.horizon_s <= 600.0):

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sim2real.artifacts.identification import TriedTerm
+from sim2real.artifacts.identification import Term
 from sim2real.identification.fit import Fit, OnProgress, as_numbers, fit
 from sim2real.identification.held_out import MOST, Fold, HeldOutPart, folds_of, leave_out
 from sim2real.identification.parameters import ParameterTable
@@ -43,21 +43,23 @@ class Fits:
     Attributes:
         inputs: The data, and the model with the terms of the estimate.
         parts: Errors without each part of the recordings, where the selection of terms has them.
-        tried: What optional terms gain on held-out parts; empty if none was tried.
+        tried: The optional terms beside the model's own ones, with their gains; empty if none was tried.
         added: The optional term that was added, as it halves the errors; "": none.
     """
 
     inputs: Inputs
     estimate: Fit
     parts: tuple[HeldOutPart, ...] | None = None
-    tried: tuple[TriedTerm, ...] = ()
+    tried: tuple[Term, ...] = ()
     added: str = ""
 
     @property
-    def terms(self) -> tuple[str, ...] | None:
-        """Names of the optional terms of the estimate; None if the model has none."""
-        names = self.estimate.problem.table.terms
-        return names if names or self.inputs.config.terms == "auto" else None
+    def terms(self) -> tuple[Term, ...] | None:
+        """The optional terms of the estimate, and those that were tried; None if there are none."""
+        tried, used = {t.name: t for t in self.tried}, self.estimate.problem.table.terms
+        rows = [replace(tried[n], used=True) if n in tried else Term(n, True) for n in used]
+        rows += [replace(t, used=False) for n, t in tried.items() if n not in used]
+        return tuple(rows) if rows or self.inputs.config.terms == "auto" else None
 
 
 def fit_model(inputs: Inputs, best: Best) -> Fits:
@@ -84,7 +86,7 @@ def fit_model(inputs: Inputs, best: Best) -> Fits:
         terms = selection.chosen.names(table) if config.terms in ("auto", "own") else own
         added = ", ".join(n for n in terms if n not in own) if not auto else ""
         beside = selection if auto or added else replace(selection, chosen=selection.trials[0])
-        tried = tuple(row for row in gains(beside, table) if row.term not in own)
+        tried = tuple(row for row in gains(beside, table) if row.name not in own)
         if auto or added:
             base, values = with_terms(inputs, ",".join(terms) or "none"), as_numbers(table, selection.chosen.x)
         parts = tuple(selection.chosen.rows) if auto else None

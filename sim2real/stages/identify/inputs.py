@@ -36,12 +36,12 @@ class Inputs:
     """The data of an identification.
 
     Attributes:
-        loaded: The robot without these.
+        loaded: The robot as its pipeline makes it, in its own world and with its own terms.
         robot: The robot in the configured world, with the optional terms that the configuration names.
         table: The parameters, with the bounds and fixed values of the configuration.
         logs: The fitted recordings, then those that are held out whole.
         hashes: SHA-256 of each log's file before the fit; "" for a recording without a file.
-        windows: Segments to fit, and segments to predict.
+        windows: Segments of one length: those to fit, and the held-out ones, which are predicted.
         standing: The recording of a robot on its feet; None: there is none.
     """
 

@@ -9,11 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sim2real.artifacts.identification import (
-    Estimate,
-    Identification,
-    Judgement,
-)
+from sim2real.artifacts.identification import WITHOUT_DELAYS, Estimate, Identification, Internal, Judgement
 from sim2real.artifacts.posterior import Posterior
 from sim2real.graph.episode import Episode
 from sim2real.identification import predictions as prediction
@@ -23,7 +19,7 @@ from sim2real.identification.expected import wider_for, with_expected_errors
 from sim2real.identification.fit import Fit, as_numbers, refit
 from sim2real.identification.held_out import HeldOutPart
 from sim2real.identification.lacks import TILT, Lack, find_lack, turned_gravity
-from sim2real.identification.predictions import NO_DELAY, positions, replays
+from sim2real.identification.predictions import positions, replays
 from sim2real.identification.residuals import Linearised, Problem, few_of
 from sim2real.identification.segments import Span, extents
 from sim2real.identification.uncertainty import (
@@ -71,15 +67,15 @@ def judge(fits: Fits) -> Identification:
             findings = patiently(lambda: Findings.of(fits.estimate, parts)) if held else findings
         fit = findings.fit
         truth = true_values(inputs.logs[0])
-        posterior = fit.problem.table.posterior(fit.x, findings.spread.scale_covariance)
+        posterior = fit.problem.table.posterior(fit.x, findings.spread.scale_covariance, findings.widening)
         document = _estimates(inputs.loaded.name, findings, posterior, truth)
-        # Predict held-out data, beside baselines.
+        # Predict held-out parts, beside baselines.
         bar.set_description_str("identify: predictions and baselines")
         document = patiently(lambda: _predicted(document, inputs, fit))
-        bar.set_description_str("identify: each recording, distribution of delays")
-        aggregate = patiently(lambda: compare_recordings(fit.problem, findings.at)) if inputs.fitted > 1 else ()
+        bar.set_description_str("identify: each log, distribution of delays")
+        over_logs = patiently(lambda: compare_recordings(fit.problem, findings.at)) if inputs.fitted > 1 else ()
         links_ = patiently(lambda: links(fit.problem, fit.x)) if config.links else ()
-        document = replace(document, terms=fits.terms, tried=fits.tried, links=links_, aggregate=aggregate)
+        document = replace(document, terms=fits.terms, links=links_, over_logs=over_logs)
         document = _compared(document, inputs, fit, parts)
         bar.set_description_str("identify: what the model lacks")
         lacks = patiently(lambda: _lack(document, inputs, fit))
@@ -92,7 +88,8 @@ def judge(fits: Fits) -> Identification:
     open_ = [f"not determined by this log: {', '.join(names)}"] if names else []
     if fits.added:
         held.insert(0, f"the term {fits.added} is part of the model: without it the errors are at least twice as large")
-    alone = verdict.decisive_part(parts, document.expected_error)
+    fields = {p.name: p.column for p in positions(inputs.model, inputs.units)}
+    alone = verdict.decisive_part(parts, document.expected_error, fields)
     return _judged(document, findings, inputs, [*held, *open_, *([alone] if alone else [])], lacks, set_by_user)
 
 
@@ -145,12 +142,12 @@ def _estimates(pipeline: str, findings: Findings, posterior: Posterior, truth: M
     spread = findings.spread if fit.converged else None
     rows = verdict.estimates(fit.problem.table, fit.values, spread, truth)
     document = Identification(pipeline, (), Judgement("", ()), rows)
-    return replace(document, posterior=posterior, widening=findings.widening) if fit.converged else document
+    return replace(document, posterior=posterior) if fit.converged else document
 
 
 def _doubted(row: Estimate) -> Estimate:
     """Return the row of a parameter of a fit that is not accepted, in which none is ok."""
-    return replace(row, verdict="not determined") if row.verdict == "ok" else row
+    return replace(row, state="not determined") if row.state == "ok" else row
 
 
 def _predicted(document: Identification, inputs: Inputs, fit: Fit) -> Identification:
@@ -164,14 +161,15 @@ def _predicted(document: Identification, inputs: Inputs, fit: Fit) -> Identifica
     errors = [row for s in horizons for row in prediction.errors(samples, list(models), measured, config.settle_s, s)]
     drawn = {name: values for name, values in models.items() if name != "nominal"}
     columns, long = free_runs(fit, inputs.episodes, inputs.fitted, config, drawn)
+    worst = prediction.worst_second(samples, measured, config.settle_s, [log.path.name for log in inputs.logs])
     return replace(
         document,
-        samples=samples,
+        samples=samples if worst is None else samples | {"worst": worst[1]},
         free=columns,
         replays={**replays(problem, fit.values, config.settle_s, "ahead"), **long},
-        settle_s=config.settle_s,
+        internal=Internal(settle_s=config.settle_s, world=config.world),
         errors=tuple(errors),
-        worst=prediction.worst_second(samples, measured, config.settle_s),
+        worst=worst and worst[0],
     )
 
 
@@ -185,8 +183,8 @@ def _without_delays(fit: Fit) -> dict[str, Mapping[str, float]]:
     largest_s = max(float(np.max(np.abs(np.subtract(fit.values[p.name], p.without)))) for p in delays)
     # A fit without delays is its own baseline: a second fit of a quadruped took 120 s and changed no estimate.
     if largest_s < _NO_DELAY_S:
-        return {NO_DELAY: as_numbers(table, fit.x, kept)}
-    return {NO_DELAY: refit(fit.problem, kept, fit.x)}
+        return {WITHOUT_DELAYS: as_numbers(table, fit.x, kept)}
+    return {WITHOUT_DELAYS: refit(fit.problem, kept, fit.x)}
 
 
 def free_runs(
@@ -217,13 +215,13 @@ def free_runs(
 
 def _compared(document: Identification, inputs: Inputs, fit: Fit, parts: Sequence[HeldOutPart]) -> Identification:
     """Return the document with expected errors, and ranges of the fitted motion."""
-    names, measured = [log.path.stem for log in inputs.logs], positions(inputs.model, inputs.units)
+    names, measured = [log.path.name for log in inputs.logs], positions(inputs.model, inputs.units)
     fitted = [s for s in inputs.windows if s.fitted]
     held_out = [[s for s in inputs.windows if s.recording == r and not s.fitted] for r in range(len(inputs.logs))]
     before, *later = (extents(inputs.model, inputs.episodes, s, fit.windows.segment_s) for s in (fitted, *held_out))
-    document = replace(document, motion=before)
+    document = replace(document, internal=replace(document.internal, motion=before))
     wider = [wider_for(before, log, measured) for log in later]
-    return with_expected_errors(document, measured, parts, names, inputs.fitted, wider)
+    return with_expected_errors(document, measured, parts, names, wider)
 
 
 def _lack(document: Identification, inputs: Inputs, fit: Fit) -> Lack:
@@ -266,7 +264,8 @@ def _judged(
         set_by_user: Parameters whose bounds the user has set.
     """
     fit = findings.fit
-    above = [str(row) for row in document.judged if row.exceeded]
+    where = lambda log: f"the held-out part of {log}" if log else "held-out parts"  # noqa: E731
+    above = [row.text(where(row.log)) for row in document.judged if row.exceeded]
     judgement = verdict.judge(
         document.held_out,
         fit.problem.table,

@@ -86,7 +86,7 @@ class Best:
         if self.folder is None or self.inputs is None or self.z is None:
             return
         done = ", ".join(f"{share:.0%} of {what}" for what, share in self.done.items())
-        reason = f"it ended after {done}: these values have no intervals and were not judged on held-out data"
+        reason = f"it ended after {done}: these values have no intervals and were not judged on held-out parts"
         Identification(
             pipeline=self.inputs.loaded.name,
             logs=self.inputs.sources(self.folder.parent),

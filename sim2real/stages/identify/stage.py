@@ -12,8 +12,9 @@ from sim2real.artifacts.identification import (
     PARAMETERS,
     ROUND_TRIP,
     Identification,
+    compared_table,
     links_table,
-    tried_table,
+    terms_table,
     with_small_unit,
 )
 from sim2real.artifacts.paths import shown
@@ -33,13 +34,6 @@ from sim2real.stages.shared.find_run import newest_recording
 from sim2real.stages.shared.identification import command, continuing, identified_robot
 from sim2real.stages.terminal.console import artifact_table, note, progress
 
-_USE = {
-    "accepted": "accepted: these parameters may be used",
-    "record again": "record again: this log does not determine all parameters",
-    "change the model": "change the model: do not use these parameters yet",
-    "not finished": "not finished: these parameters are no estimates yet",
-}
-"""Status -> whether the parameters may be used."""
 _MOST_ROWS = 12
 """Rows of a table of errors on the console; 120 logs have 480."""
 
@@ -89,7 +83,6 @@ def _identify(inputs: Inputs, best: Best) -> Identification:
         identification,
         logs=inputs.sources(),
         units=inputs.units,
-        world=inputs.config.world,
         noise=noises(identification.samples, inputs.units),
         timing=inputs.logs[0].timing,
     )
@@ -141,18 +134,18 @@ def _write(identification: Identification, stage: OpenStage, robot: RecordedRobo
 def show(identification: Identification) -> None:
     """Print the verdict: may I use it, why, how far off will it be, what do I do next. Then print the details."""
     verdict = identification.verdict
-    note(f"verdict: {_USE.get(verdict.status, verdict.status)}")
+    note(f"verdict: {identification.headline}")
     for reason in verdict.reasons[:1]:
         note(f"reason: {reason}")
     note(f"expected error: {identification.outlook()}")
     note(f"next: {verdict.next}")
     print(artifact_table(identification.rows()))
-    if identification.aggregate:
-        print(artifact_table(identification.recordings_table().without("s.e.")))
-    if identification.tried:
-        print(artifact_table(tried_table(identification.tried)))
+    if identification.over_logs:
+        print(artifact_table(identification.logs_table()))
+    if identification.terms:
+        print(artifact_table(terms_table(identification.terms)))
     if identification.errors:
-        print(artifact_table(identification.errors_table(), _MOST_ROWS))
+        print(artifact_table(compared_table(identification.judged), _MOST_ROWS))
     if identification.links:
         print(artifact_table(links_table(identification.links)))
     if len(verdict.reasons) > 1:
@@ -160,7 +153,7 @@ def show(identification: Identification) -> None:
     for reason in verdict.reasons[1:]:
         note(f"  {reason}")
     if identification.worst is not None:
-        note(f"  the worst second: {identification.worst.text(identification.logs)}")
+        note(f"  the worst second: {identification.worst}")
 
 
 def summary(identification: Identification) -> dict[str, str]:
@@ -171,7 +164,7 @@ def summary(identification: Identification) -> dict[str, str]:
         lines["round trip delay"] = f"{1e3 * total.estimate:.1f} ms"
     for worst in identification.held_out[:1]:
         size = "diverges" if worst.error is None else with_small_unit(worst.error, worst.unit)
-        lines["error on held-out data"] = f"{worst.name} {size} {worst.seconds:.3g} s ahead"
+        lines["error on held-out parts"] = f"{worst.joint} {size} {worst.seconds:.3g} s ahead"
     lines["expected error"] = identification.outlook()
     lines["verdict"] = identification.verdict.status
     return lines
@@ -199,13 +192,13 @@ def _begin(path: str, robot: RecordedRobot) -> dict[str, float]:
             f"{path} is of pipeline {earlier.pipeline!r}, not of {robot.name!r}",
             hint="begin at an identification of the same robot, or leave --begin out",
         )
-    return {p.name: p.estimate for p in earlier.parameters if p.kind != "derived" and p.verdict != "fixed"}
+    return {p.name: p.estimate for p in earlier.parameters if p.kind != "derived" and p.state != "fixed"}
 
 
 def find_logs(
     robot: RecordedRobot, config: IdentifyConfig, root: Path, run_dir: Path | None
 ) -> tuple[list[Path], Path | None]:
-    """Return the logs to work on, those that are held out last, and the run folder to write into.
+    """Return the logs, held-out ones at the end, and the run folder.
 
     Args:
         config: Names logs, or none: then the newest finished recording is taken.

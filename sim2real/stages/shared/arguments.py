@@ -211,7 +211,7 @@ def check_parameters(identification: Identification, robot: RecordedRobot) -> No
             f"these are parameters of pipeline {identification.pipeline!r}, not of {robot.name!r}", hint=hint
         )
     identification.needed_posterior(hint)
-    robot = in_world(robot, identification.world)
+    robot = in_world(robot, identification.internal.world)
     expected = robot.identifiable(defaults_of(robot).identify.max_delay_s).parameters.names
     there = {p.name for p in identification.parameters if p.standard_error is not None}
     if lacking := [n for n in expected if n not in there]:

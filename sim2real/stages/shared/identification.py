@@ -79,7 +79,7 @@ def identified_robot(identification: Identification, robot: RecordedRobot) -> tu
     Raises:
         UsageError: Its world is not installed.
     """
-    robot = in_world(robot, identification.world)
+    robot = in_world(robot, identification.internal.world)
     present, offered = (
         {p.name: p.term for p in r.identifiable(_ANY_DELAY_S).parameters} for r in (robot, offering(robot, "all"))
     )
@@ -88,10 +88,10 @@ def identified_robot(identification: Identification, robot: RecordedRobot) -> tu
         robot = offering(robot, ",".join(lacking))
     # The model needs room for the identified delays, which may be longer than the pipeline's longest one.
     highs = {p.name: p.high for p in robot.identifiable(1.0).parameters if p.kind == "delay"}
-    uppers = {p.name: p.upper for p in identification.parameters if p.kind == "delay" and p.verdict != "fixed"}
+    uppers = {p.name: p.upper for p in identification.parameters if p.kind == "delay" and p.state != "fixed"}
     needed_s = [u / highs[n] for n, u in uppers.items() if u is not None and n in highs]
     longest_s = max([defaults_of(robot).identify.max_delay_s, *needed_s])
-    return robot, replace(defaults_of(robot).identify, settle_s=identification.settle_s, max_delay_s=longest_s)
+    return robot, replace(defaults_of(robot).identify, settle_s=identification.internal.settle_s, max_delay_s=longest_s)
 
 
 # The segments of logs.

@@ -96,16 +96,16 @@ def _most_likely(posterior: Posterior, name: str, estimate: float, by: float) ->
     # The move on the scale of the posterior, within the bounds.
     moved = posterior.names.index(name)
     kind = posterior.transform[moved]
-    low, high = (float(from_scale(kind, bound[moved])) for bound in (posterior.low, posterior.high))
+    low, high = (float(from_scale(kind, bound[moved])) for bound in (posterior.lower, posterior.upper))
     to_scale = TRANSFORMS[kind][0]
     step = to_scale(np.clip(estimate + by, low, high)) - to_scale(estimate)
 
     # The others follow by regression on the moved one; all stop where the first reaches its bound.
     spread = posterior.covariance[moved]
     shift = step * (spread / spread[moved] if spread[moved] > 0.0 else np.eye(len(spread))[moved])
-    room = np.where(shift > 0, posterior.high, posterior.low) - posterior.mean
+    room = np.where(shift > 0, posterior.upper, posterior.lower) - posterior.mean
     share = np.min(np.divide(room, shift, out=np.ones_like(shift), where=shift != 0.0), initial=1.0)
-    x = np.clip(posterior.mean + max(share, 0.0) * shift, posterior.low, posterior.high)
+    x = np.clip(posterior.mean + max(share, 0.0) * shift, posterior.lower, posterior.upper)
     return {n: float(from_scale(t, v)) for n, t, v in zip(posterior.names, posterior.transform, x, strict=True)}
 
 

@@ -158,13 +158,13 @@ def _world(config: TrainConfig, identification: Identification | None) -> str | 
     """Return the world to train in."""
     if identification is None:
         return config.world
-    if config.world not in (None, identification.world):
-        world = repr(identification.world) if identification.world else "the robot's own"
+    if config.world not in (None, identification.internal.world):
+        world = repr(identification.internal.world) if identification.internal.world else "the robot's own"
         raise UsageError(
             f"these parameters are of another world, {world}, than {config.world!r}",
             hint=f"identify with --world {config.world}, or train with --model nominal",
         )
-    return identification.world
+    return identification.internal.world
 
 
 def _replaced(values: Mapping[str, float], changed: Mapping[str, float]) -> dict[str, float]:
@@ -186,7 +186,7 @@ def _set_noise(sensor: BaseNode, identification: Identification | None, config: 
     """Give the simulated sensor the noise of the log; return it.
 
     Readings that no log determines, such as the orientation of a robot in a stand, keep the robot's nominal noise. So
-    do biases, which are constant in a log.
+    do offsets, which are constant in a log.
     """
     factor = config.vary.noise
     if identification is None or not identification.noise or not factor:
@@ -194,20 +194,20 @@ def _set_noise(sensor: BaseNode, identification: Identification | None, config: 
     if not isinstance(sensor, SimSensor):
         note(f"readings are exact: {type(sensor).__name__} takes no noise, as sim2real.robots.nodes.SimSensor does")
         return ()
-    nominal = {n.column: n for n in sensor.noise}
-    logged = {n.column: n for n in identification.noise}
-    biases = {column: n.bias for column, n in nominal.items()}
+    nominal = {n.field: n for n in sensor.noise}
+    logged = {n.field: n for n in identification.noise}
+    offsets = {field: n.offset for field, n in nominal.items()}
     sensor.noise = (
         *(
             replace(
                 n,
                 deviation=factor * n.deviation,
-                quantum=factor * n.quantum,
-                bias=factor * max(n.bias, biases.get(column, 0.0)),
+                resolution=factor * n.resolution,
+                offset=factor * max(n.offset, offsets.get(field, 0.0)),
             )
-            for column, n in logged.items()
+            for field, n in logged.items()
         ),
-        *(n for column, n in nominal.items() if column not in logged),
+        *(n for field, n in nominal.items() if field not in logged),
     )
     return sensor.noise
 
@@ -226,7 +226,7 @@ def _episodes(
     estimates = {p.name: p for p in identification.parameters} if identification is not None else {}
     columns = {n: d for n, d in draws.items() if n not in DELAYS}
     rows = [
-        Varied(n, p.unit, values[n], p.low95, p.high95, p.verdict == "not determined")
+        Varied(n, p.unit, values[n], p.low95, p.high95, p.state == "not determined")
         if (p := estimates.get(n)) is not None
         else Varied(n, "", values[n])
         for n in columns
@@ -246,7 +246,7 @@ def _episodes(
     widens = config.vary.misfit and not config.vary.uniform
     return Episodes(
         parameters=tuple(rows),
-        widening=(identification.widening if identification and widens else None) or 1.0,
+        widening=identification.posterior.widening if identification and identification.posterior and widens else 1.0,
         noise=noise,
         timelines=config.timelines,
         cut=drawn.cut,
@@ -278,7 +278,7 @@ def _with_disturbances(
         added |= {name: (unit, hit[hit != 0.0]) for name, unit, hit in pushes.named(kicks) if hit.any()}
     return replace(
         episodes,
-        noise=tuple(replace(n, deviation=share * n.deviation, bias=share * n.bias) for n in episodes.noise),
+        noise=tuple(replace(n, deviation=share * n.deviation, offset=share * n.offset) for n in episodes.noise),
         parameters=(*episodes.parameters, *(Varied(name, unit, 0.0) for name, (unit, _) in added.items())),
         draws={**draws, **{name: np.ravel(np.asarray(values, np.float64)) for name, (_, values) in added.items()}},
         push_hz=vary.push_hz if pushes is not None else 0.0,

@@ -12,10 +12,7 @@ import numpy as np
 
 from sim2real.artifacts.files import plain, to_json
 from sim2real.artifacts.identification import (
-    AHEAD,
-    FREE_RUN,
     ComparedError,
-    ErrorKind,
     Identification,
     compared_table,
 )
@@ -75,8 +72,8 @@ class Validation(Shown):
 
     @property
     def beaten(self) -> tuple[ComparedError, ...]:
-        """The errors that a baseline does not exceed."""
-        return tuple(e for e in self.errors if e.beaten_by)
+        """The errors with a baseline that is as good."""
+        return tuple(e for e in self.errors if e.as_good)
 
     @property
     def holds(self) -> bool:
@@ -86,13 +83,11 @@ class Validation(Shown):
     @property
     def verdict(self) -> str:
         """The result in one sentence."""
-        logs = len({e.source for e in self.errors})
+        logs = len({e.log for e in self.errors})
         which = "this log" if logs == 1 else f"these {logs} logs"
         if self.beaten:
             worst = self.beaten[0]
-            return (
-                f"no improvement on {worst.source}: {worst.name} is predicted as well by {', '.join(worst.beaten_by)}"
-            )
+            return f"no improvement on {worst.log}: {worst.joint} is predicted as well by {', '.join(worst.as_good)}"
         if self.exceeded:
             further = len(self.exceeded) - 1
             rest = f" ({further} more of {len(self.errors)} errors are above)" if further else ""
@@ -110,7 +105,7 @@ class Validation(Shown):
 
     def rows(self) -> ArtifactTable:
         """Return a row for each error, with those of the baselines where windows are predicted."""
-        return compared_table(self.errors, "log")
+        return compared_table(self.errors)
 
 
 def run(config: ValidateConfig) -> bool:
@@ -228,35 +223,33 @@ def score(
         raise UsageError("; ".join(f"{path}: {reason}" for path, reason in refused.items()) or "no log was given")
 
     # Predict windows of the horizon, and a free run of each log; a short log has shorter ones.
-    limits = {(e.column, e.kind): e for e in identification.expected_error}
     horizon_s = next((row.seconds for row in identification.held_out), fitting.horizon_s)
-    run_s = max((e.seconds for k, e in limits.items() if k[1] == FREE_RUN), default=_FREE_RUN_S)
+    run_s = max((e.seconds for e in identification.expected_error if e.free_run), default=_FREE_RUN_S)
     errors, measured = list[ComparedError](), positions(model, robot.units)
-    kinds: tuple[tuple[ErrorKind, float], ...] = ((AHEAD, horizon_s), (FREE_RUN, run_s))
     with progress(None, "validate: simulate"):
         windows = None
-        for kind, most_s in kinds:
-            values = models if kind == AHEAD else {"identified": models["identified"]}
+        for free_run, most_s in ((False, horizon_s), (True, run_s)):
+            values = {"identified": models["identified"]} if free_run else models
             seconds = [min(most_s, length) for length in lengths]
-            windows = _windows(model, good, seconds, fitting, kind, windows)
+            windows = _windows(model, good, seconds, fitting, free_run, windows)
             columns = prediction.samples(windows, values, fitting.settle_s)
             for r, log in enumerate(good):
                 spans = [span for span in windows.spans if span.recording == r]
                 seen = extents(model, [log.episode for log in good], spans, fitting.settle_s + seconds[r])
-                wider = wider_for(identification.motion, seen, measured)
+                wider = wider_for(identification.internal.motion, seen, measured)
                 moves = moving(windows, np.flatnonzero(windows.recording == r))
                 moves = dict(zip(prediction.labels(windows), moves, strict=True))
+                moves = {p.name: moves[p.column] for p in measured}
                 of_log = {name: column[columns["recording"] == r] for name, column in columns.items()}
                 rows = prediction.errors(of_log, list(values), measured, fitting.settle_s, seconds[r])
-                for row in (row for row in rows if moves[row.column]):
-                    limit, factor = limits.get((row.column, kind)), wider.get(row.column, 1.0)
-                    found = replace(row, source=log.path.name, kind=kind, seconds=seconds[r], wider=factor)
-                    if limit is not None:
-                        found = replace(found, expected=factor * limit.error)
-                    errors.append(found if kind == AHEAD else replace(found, beaten_by=(), baselines={}))
+                for row in (row for row in rows if moves[row.joint]):
+                    limit = identification.expected_of(row.joint, free_run)
+                    expected = None if limit is None else wider.get(row.joint, 1.0) * limit.error
+                    found = replace(row, log=log.path.name, free_run=free_run, seconds=seconds[r], expected=expected)
+                    errors.append(replace(found, as_good=(), baselines={}) if free_run else found)
     # A joint that rests is not compared: "no motion" would always be best.
-    moved = {(e.source, e.column) for e in errors if e.kind == AHEAD}
-    resting = {log.path.name: [p.name for p in measured if (log.path.name, p.column) not in moved] for log in good}
+    moved = {(e.log, e.joint) for e in errors}
+    resting = {log.path.name: [p.name for p in measured if (log.path.name, p.name) not in moved] for log in good}
     if not errors:
         raise UsageError("no joint moves in this log, so it tests no parameter", hint="take a log of motion")
     ordered = tuple(sorted(errors, key=lambda e: -(e.ratio or 0.0)))
@@ -273,7 +266,10 @@ def models_of(identification: Identification, model: IdentifiableModel) -> dict[
     """
     estimates = {p.name: p.estimate for p in identification.parameters}
     if lacking := [p.name for p in model.parameters if p.name not in estimates]:
-        raise UsageError(f"the parameters lack {', '.join(lacking)}", hint="they are of another state of the robot")
+        raise UsageError(
+            f"the parameters lack {', '.join(lacking)}",
+            hint="identified with another version of this robot's model: identify again",
+        )
     return {
         "identified": {p.name: estimates[p.name] for p in model.parameters},
         "nominal": {p.name: p.nominal for p in model.parameters},
@@ -285,7 +281,7 @@ def _windows(
     logs: Sequence[Recording],
     seconds: Sequence[float],
     config: IdentifyConfig,
-    kind: ErrorKind,
+    free_run: bool,
     like: Problem | None,
 ) -> Problem:
     """Return logs in segments without a fitted one; a free run is one segment a log.
@@ -297,7 +293,7 @@ def _windows(
     spans, ends_s = list[Span](), list[float]()
     for r, (log, own_s) in enumerate(zip(logs, seconds, strict=True)):
         begins = side_by_side(log.episode, config, config.settle_s + own_s)
-        begins = begins[:1] if kind == FREE_RUN else begins
+        begins = begins[:1] if free_run else begins
         spans += [Span(r, begin, False) for begin in begins]
         ends_s += [config.settle_s + own_s] * len(begins)
     like = like or Problem(model, [log.episode for log in logs], spans, max(ends_s), config)

@@ -33,7 +33,7 @@ def draw_robots(
         share = min(vary.uniform * randomise, 0.99)
         draws = {n: v * rng.uniform(1.0 - share, 1.0 + share, COUNT) for n, v in values.items() if v}
     elif identification is not None and identification.posterior is not None and randomise:
-        factor = identification.widening if vary.misfit and identification.widening is not None else 1.0
+        factor = identification.posterior.widening if vary.misfit else 1.0
         sampled = widen_posterior(identification, identification.posterior, factor).sample(rng, COUNT, randomise)
         kinds = {p.name: p.kind for p in identification.parameters}
         draws = {n: v for n, v in sampled.items() if kinds.get(n) in ("dynamics", "delay")}
@@ -63,15 +63,15 @@ def without_default_ranges(
 def widen_posterior(identification: Identification, posterior: Posterior, factor: float) -> Posterior:
     """Return the identification's posterior with deviations times a factor.
 
-    The variance between recordings is added after that.
+    The variance between logs is added after that.
     """
     covariance = posterior.covariance * factor**2
     names = list(posterior.names)
 
-    # Add the variance between recordings, on the scale of the posterior.
-    for quantity in identification.aggregate:
-        if quantity.name in names:
-            i = names.index(quantity.name)
-            slope = float(TRANSFORMS[posterior.transform[i]][2](np.float64(quantity.mean)))
-            covariance[i, i] += (quantity.between / slope) ** 2
+    # Add the variance between logs, on the scale of the posterior.
+    for row in identification.over_logs:
+        if row.name in names:
+            i = names.index(row.name)
+            slope = float(TRANSFORMS[posterior.transform[i]][2](np.float64(row.mean)))
+            covariance[i, i] += (row.spread / slope) ** 2
     return replace(posterior, covariance=covariance)

@@ -24,14 +24,14 @@ class WarpEngine(Engine):
     the state. So all of the state belongs to one copy, and copies can be selected, sliced and merged as on MJX's JAX.
 
     Args:
-        nconmax: Contacts that there is room for, times the number of copies, which share it; None: MuJoCo Warp's guess.
-        njmax: Rows of constraints that there is room for in each copy; None: MuJoCo Warp's guess.
+        nconmax: Most contacts of a copy, on average: the copies share the room for all. None: MuJoCo Warp's guess.
+        njmax: Most rows of the solver of each copy, for contacts, limits and equalities. None: MuJoCo Warp's guess.
 
     Raises:
         UsageError: When the package or a device is missing, or MuJoCo Warp cannot run the model.
 
     Attributes:
-        start: The ``mjx.Data`` of the model's initial state, nothing computed.
+        start: The ``mjx.Data`` of the model's initial state, before the first forward pass.
     """
 
     def __init__(self, host: MjModel, nconmax: int | None = None, njmax: int | None = None) -> None:
