@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,7 +28,7 @@ def build_onnx(weights: Mapping[str, np.ndarray], contract: PolicyContract, spec
     Args:
         spec: One of the networks in ``BUILT_IN``; default: a perceptron whose output is clipped.
     """
-    from onnx import helper
+    from onnx import TensorProto, checker, helper, numpy_helper
 
     spec = spec or NetworkSpec()
     low, high = weights["low"], weights["high"]
@@ -72,44 +72,23 @@ def build_onnx(weights: Mapping[str, np.ndarray], contract: PolicyContract, spec
         helper.make_node("Mul", ["shifted", "half_range"], ["stretched"]),
         helper.make_node("Add", ["stretched", "low"], ["action"]),
     ]
-    arrays = {name: np.asarray(value, np.float32) for name, value in constants.items()}
-    sizes = contract.observation_size, len(contract.action)
-    return with_contract(make_model(nodes, arrays, sizes, initial), contract)
-
-
-def make_model(
-    nodes: Sequence[NodeProto],
-    constants: Mapping[str, np.ndarray],
-    sizes: tuple[int, int],
-    initial: Sequence[np.ndarray],
-) -> bytes:
-    """Return the serialised model of a policy.
-
-    Args:
-        nodes: From ``observation (1, O)`` and ``carry_<i> (1, ...)`` to ``action (1, A)`` and ``next_carry_<i>``.
-        constants: Name -> array.
-        sizes: Of observation and action.
-        initial: The carry into the first step.
-    """
-    from onnx import TensorProto, checker, helper, numpy_helper
-
-    def described(name: str, shape: tuple[int, ...]) -> ValueInfoProto:
-        return helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, *shape])
 
     # The carry is an input and an output of the graph; its first value is in the model's properties.
-    carried = [np.shape(array) for array in initial]
+    def described(name: str, size: int) -> ValueInfoProto:
+        return helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, size])
+
     graph = helper.make_graph(
-        list(nodes),
+        nodes,
         "policy",
-        [described("observation", sizes[:1]), *(described(f"carry_{i}", s) for i, s in enumerate(carried))],
-        [described("action", sizes[1:]), *(described(f"next_carry_{i}", s) for i, s in enumerate(carried))],
-        [numpy_helper.from_array(value, name) for name, value in constants.items()],
+        [described("observation", contract.observation_size), *(described("carry_0", len(c)) for c in initial)],
+        [described("action", len(contract.action)), *(described("next_carry_0", len(c)) for c in initial)],
+        [numpy_helper.from_array(np.asarray(value, np.float32), name) for name, value in constants.items()],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
     if initial:
-        helper.set_model_props(model, {INITIAL_CARRY: json.dumps([np.asarray(array).tolist() for array in initial])})
+        helper.set_model_props(model, {INITIAL_CARRY: json.dumps([array.tolist() for array in initial])})
     checker.check_model(model, full_check=True)
-    return model.SerializeToString()
+    return with_contract(model.SerializeToString(), contract)
 
 
 def with_contract(graph: bytes, contract: PolicyContract) -> bytes:

@@ -29,6 +29,15 @@ CONTRACT = PolicyContract(
 )
 
 
+EXTRA = "the extra network"
+
+
+def importorskip():
+    """Skip a test of what is exported where one of the packages is missing."""
+    pytest.importorskip("jax2onnx", reason=EXTRA)
+    pytest.importorskip("onnxruntime")
+
+
 class Normalised(linen.Module):
     outputs: int
 
@@ -52,6 +61,7 @@ class Remembering(linen.Module):
 
 @pytest.fixture(scope="module")
 def learnt():
+    importorskip()
     config = dataclasses.replace(CONFIG, network=f"{__name__}:Normalised", critic="mlp")
     return train(Bandit(), config, jax.random.key(0))
 
@@ -64,7 +74,6 @@ def test_a_module_of_flax_is_trained(learnt):
 
 @pytest.mark.night
 def test_its_bundle_runs_without_jax_and_without_its_code(learnt, tmp_path):
-    pytest.importorskip("onnxruntime")
     policy = learnt.best
     folder = save_bundle(tmp_path, policy.to_weights(), CONTRACT, spec=policy.spec, graph=export_graph(policy))
     code = f"""
@@ -120,7 +129,7 @@ BLOCKS = {
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.night)])
 def test_what_is_exported_acts_as_in_jax(seed):
     """All blocks in pairs, drawn at random, one after the other; the export compares with JAX on 64 observations."""
-    pytest.importorskip("onnxruntime")
+    importorskip()
     drawn_blocks = np.random.default_rng(seed).permutation(sorted(BLOCKS))
     pairs = list(zip(drawn_blocks[::2], drawn_blocks[1::2], strict=True))
 
@@ -137,7 +146,7 @@ def test_what_is_exported_acts_as_in_jax(seed):
 
 @pytest.mark.night
 def test_what_remembers_is_exported_with_what_it_begins_with(tmp_path):
-    pytest.importorskip("onnxruntime")
+    importorskip()
     policy = drawn(Remembering, inputs=2)
     contract = dataclasses.replace(CONTRACT, action=tuple(ActionTerm(name, "1", -1.0, 2.0) for name in "ab"))
     folder = save_bundle(tmp_path, policy.to_weights(), contract, spec=policy.spec, graph=export_graph(policy))
@@ -150,18 +159,18 @@ def test_what_remembers_is_exported_with_what_it_begins_with(tmp_path):
 
 
 def test_an_export_that_differs_from_jax_is_refused():
-    pytest.importorskip("onnxruntime")
+    importorskip()
     model = export_graph(drawn(Normalised, 1))
     with pytest.raises(Sim2RealError, match=r"JAX and ONNX disagree by .* of the action range"):
         compare(drawn(Normalised, 0), model)
 
 
-class Sorted(linen.Module):
+class Decomposed(linen.Module):
     outputs: int
 
     @linen.compact
     def __call__(self, x):
-        return linen.Dense(self.outputs)(jnp.sort(x))
+        return linen.Dense(self.outputs)(jnp.linalg.svd(jnp.outer(x, x))[1])
 
 
 class Averaged(linen.Module):
@@ -191,7 +200,7 @@ class Wrong:
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
-        (Sorted, r"Sorted uses sort of float32, which is not exported to ONNX[\s\S]*hint: primitives that are: .*tanh"),
+        (Decomposed, r"Decomposed is not exported to ONNX, so no robot could run it: svd[\s\S]*hint: use layers that"),
         (Averaged, r"Averaged has variables besides its parameters: batch_stats[\s\S]*hint: .*LayerNorm"),
         (lambda n: Wrong(n, shape=5), r"returns float32 of shape \(5,\) for an input of shape \(3,\), .*\(2,\)"),
         (lambda n: Wrong(n, carry=np.int32(0)), "must keep the form of its initial carry, arrays of float32"),
@@ -204,16 +213,27 @@ class Wrong:
     ],
 )
 def test_what_cannot_be_trained_or_exported_is_refused_before(kind, message):
+    if kind is Decomposed:
+        pytest.importorskip("jax2onnx", reason=EXTRA)
     with pytest.raises(UsageError, match=message):
         make_network(kind, (8,), 3, 2)
 
 
 def test_a_value_function_need_not_be_exported():
-    assert make_network(Sorted, (), 3, 1, exported=False).initial_carry() == ()
+    assert make_network(Decomposed, (), 3, 1, exported=False).initial_carry() == ()
+
+
+def test_without_jax2onnx_a_network_is_refused_before_training(monkeypatch):
+    monkeypatch.setitem(sys.modules, "jax2onnx", None)
+    with pytest.raises(
+        UsageError, match=r"Normalised is exported to ONNX by jax2onnx, which is not installed[\s\S]*hint: pip"
+    ):
+        make_network(Normalised, (8,), 3, 2)
+    assert make_network("gru", (8,), 3, 2).widths == (8, 2), "networks of this package need none"
 
 
 def test_a_network_without_flax_needs_three_functions():
-    pytest.importorskip("onnxruntime")
+    importorskip()
     assert export_graph(drawn(Wrong)) is not None
 
 

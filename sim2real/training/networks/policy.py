@@ -176,7 +176,7 @@ def _from_arrays(kind: str | Factory, arrays: Mapping[str, jax.Array]) -> tuple[
     # A user's network: make it again, and compare its parameters with the arrays.
     require(arrays, BESIDES)
     inputs, outputs = arrays["mean"].size, arrays["log_std"].size
-    network = make_network(kind, (), inputs, outputs)
+    network = make_network(kind, (), inputs, outputs, exported=False)
     example = network.init(np.random.default_rng(0), inputs, 1.0)
     named = _named(example)
     require(arrays, [name for name, _ in named])
