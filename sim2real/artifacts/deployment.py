@@ -199,12 +199,15 @@ class Verdict:
     Attributes:
         reasons: The one that decides first.
         stages: The stages to run next; empty if none helps, or none is needed.
+        terms: The optional terms to identify with next: those of the identification, and that of the parameter that
+            changed, without which the model bends its other parameters; "" without an identification.
         next: The command to type; "" if none is needed.
     """
 
     status: Status
     reasons: tuple[Reason, ...]
     stages: tuple[str, ...] = ()
+    terms: str = ""
     next: str = ""
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from sim2real.artifacts.bundle import Bundle
-from sim2real.artifacts.deployment import Deployment, Drift
+from sim2real.artifacts.deployment import Deployment, Verdict
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.iterations import Iteration, iterations, iterations_table
 from sim2real.artifacts.paths import shown
@@ -21,7 +21,6 @@ from sim2real.commands.stages import RunFlags, module_of
 from sim2real.errors import DelayChanged, UsageError
 from sim2real.robots.robot import RecordedRobot
 from sim2real.stages.config import DeployConfig, IdentifyConfig, RecordConfig, TrainConfig
-from sim2real.stages.deploy.verdict import terms_to_identify
 from sim2real.stages.load import AnyRobot, defaults_of, robot_of, shipped_policy
 from sim2real.stages.shared.arguments import AnyPath, config_of, folder_of
 from sim2real.stages.shared.find_run import find_run
@@ -146,31 +145,36 @@ class _Iterating:
         lacking = tuple(s for s in STAGES if s not in status or status[s].stale)
         if not rows:
             return Plan(lacking)
-        last, drift, stages = rows[-1], None, STAGES
+        last, verdict, stages = rows[-1], None, STAGES
         # A recording that is older than the refusal of a policy shows another robot.
         recorded = status["record"].newest.manifest.started if "record" in status else ""
         if not (last.refused and recorded < last.deployment.manifest.started):
             deployment = None if last.refused else Deployment.read(last.deployment.folder)
-            drift = None if deployment is None else deployment.drift
+            verdict = None if deployment is None else deployment.verdict
             if lacking and resumed:  # the run was interrupted, or a stage was made by hand
-                return self._again(run_dir, lacking, drift)
+                return self._again(run_dir, lacking, verdict)
             if deployment is not None and (why := _why_stopped(deployment)):
                 return Plan((), f"stop: {why}")
             # Train alone if the model holds, and the timing of the training does, too. Otherwise record: the motion of
             # a policy may not separate a delay from inertia.
-            if deployment is not None and deployment.verdict and deployment.verdict.stages == ("train",):
+            if verdict is not None and verdict.stages == ("train",):
                 stages = ("train", "deploy")
         if len(rows) >= self.flags.iterations:
             return Plan((), f"the last iteration: next would be {', '.join(stages)}")
-        return self._again(run_dir, stages, drift)
+        return self._again(run_dir, stages, verdict)
 
-    def _again(self, run_dir: Path, stages: tuple[str, ...], drift: Drift | None) -> Plan:
+    def _again(self, run_dir: Path, stages: tuple[str, ...], verdict: Verdict | None) -> Plan:
         """Return the plan to run stages with the terms of the newest identification, and another seed."""
         identified, trained = finished(run_dir, "identify"), finished(run_dir, "train")
         if identified is None:
             return Plan(stages)
         known = Identification.load(identified.output("parameters"))
-        terms = terms_to_identify(self.flags.identify.terms, self.robot, known, drift)
+        # The verdict adds the term of a parameter that changed to those of the identification.
+        terms = self.flags.identify.terms
+        if terms not in ("auto", "all") and verdict is not None and verdict.terms:
+            terms = verdict.terms
+        elif terms not in ("auto", "all") and known.used_terms is not None:
+            terms = ",".join(known.used_terms) or "none"
         # The same seed would train the same policy.
         seed = self.flags.train.seed if trained is None else 1 + int(trained.manifest.config["seed"])
         return Plan(stages, terms=terms, seed=seed)

@@ -14,7 +14,7 @@ from sim2real.artifacts.recording import Recording
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode, Steps
 from sim2real.stages.deploy import replay, simulation, verdict
-from sim2real.stages.deploy.verdict import decide, next_command
+from sim2real.stages.deploy.verdict import decide, next_command, terms_to_identify
 from sim2real.stages.load import load_robot
 
 FRICTION = Changed("friction", "rad/s^2", 6.0, 12.0, 11.0, 13.0, 0.9, 1e-20)
@@ -160,6 +160,7 @@ def test_the_command_can_be_typed(found, status, command, folder):
     found = deployed(**found)
     told = decide(found)
     assert told.status == status
+    told = replace(told, terms="own")
     assert next_command(told, found, load_robot("pendulum"), IDENTIFIED, folder) == command
 
 
@@ -183,10 +184,10 @@ def test_what_an_arm_holds_is_identified_from_then_on(drift, terms, command, tmp
     (folder / "manifest.json").write_text('{"stage": "deploy"}')
     logs = tuple(Recording(folder.relative_to(tmp_path) / f"episode_{i}.mcap", episode()) for i in (0, 1))
     found = replace(deployed(drift=drift), recordings=logs)
-    told = Verdict("re-identify", (), ("identify",))
-    assert sorted(next_command(told, found, load_robot("arm"), replace_terms(terms), folder).split()) == sorted(
-        command.split()
-    )
+    robot, identified = load_robot("arm"), replace_terms(terms)
+    wanted = terms_to_identify(robot.defaults.identify, robot, identified, drift)
+    told = Verdict("re-identify", (), ("identify",), wanted)
+    assert sorted(next_command(told, found, robot, identified, folder).split()) == sorted(command.split())
 
 
 def replace_terms(terms):

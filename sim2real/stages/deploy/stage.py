@@ -88,8 +88,8 @@ def _deployed(
     from sim2real.stages.deploy.simulation import compare
     from sim2real.stages.deploy.verdict import judge
 
-    world = None if identification is None else identification.internal.world
-    deployment = compare(in_world(robot, world), recordings, bundle, identification, config.duration_s)
+    robot = in_world(robot, None if identification is None else identification.internal.world)
+    deployment = compare(robot, recordings, bundle, identification, config.duration_s)
     probe = Recording.load(folder / PROBE) if (folder / PROBE).is_file() else None
 
     # Judge the model and the policy.

@@ -16,7 +16,8 @@ from sim2real.artifacts.paths import shown
 from sim2real.artifacts.run import MANIFEST
 from sim2real.errors import OtherMotion, Sim2RealError
 from sim2real.installation import has_jax
-from sim2real.robots.robot import RecordedRobot, in_world, watched
+from sim2real.robots.robot import RecordedRobot, watched
+from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.load import defaults_of
 from sim2real.stages.shared.identification import command
 from sim2real.stages.terminal.console import progress
@@ -41,11 +42,15 @@ def judge(
     """Return a deployment with the tests of its model, and a verdict.
 
     Args:
+        robot: In the world of the identification.
         identification: The model; None: it is not tested.
         folder: Folder of the deployment, for the next command.
     """
     deployment = _tested(deployment, robot, identification)
     verdict = decide(deployment)
+    if identification is not None:
+        usual = defaults_of(robot).identify
+        verdict = replace(verdict, terms=terms_to_identify(usual, robot, identification, deployment.drift))
     typed = next_command(verdict, deployment, robot, identification, folder)
     return replace(deployment, verdict=replace(verdict, next=typed))
 
@@ -196,38 +201,34 @@ def next_command(
     then = [shlex.join(["sim2real", stage, robot.name, *run]) for stage in stages if stage in ("train", "deploy")]
     if "identify" not in stages and "record" not in stages:
         return " && ".join(then)
-    usual = defaults_of(robot).identify
+    usual = replace(defaults_of(robot).identify, terms=verdict.terms)
     logs = logs_to_identify([r.path for r in deployment.logs], deployment.drift, identification, folder)
-    terms = terms_to_identify(usual.terms, robot, identification, deployment.drift)
     # Without logs that suffice the robot is recorded first.
     if "record" in stages or not logs:
         record = shlex.join(["sim2real", "record", robot.name])
-        identify = shlex.join(["sim2real", "identify", robot.name, "--terms", terms])
-        return record if terms == usual.terms else f"{record} && {identify}"
-    identify = command(robot, replace(usual, log=logs, terms=terms), Path("runs"), shlex.join(run))
-    return " && ".join([identify, *then])
+        identify = shlex.join(["sim2real", "identify", robot.name, "--terms", verdict.terms])
+        return record if verdict.terms == defaults_of(robot).identify.terms else f"{record} && {identify}"
+    return " && ".join([command(robot, replace(usual, log=logs), Path("runs"), shlex.join(run)), *then])
 
 
 def terms_to_identify(
-    configured: str, robot: RecordedRobot, identification: Identification, drift: Drift | None
+    usual: IdentifyConfig, robot: RecordedRobot, identification: Identification, drift: Drift | None
 ) -> str:
-    """Return the optional terms to identify with: those of the identification, and that of the parameter that changed.
-
-    A model without the changed term, such as a payload, bends its other parameters instead.
+    """Return the optional terms to identify with next; see ``Verdict``.
 
     Args:
-        configured: ``terms`` of ``IdentifyConfig``.
+        usual: The robot's settings.
+        robot: In the world of the identification.
     """
-    if configured in ("auto", "all"):
-        return configured
-    robot, max_delay_s = in_world(robot, identification.internal.world), defaults_of(robot).identify.max_delay_s
-    default = robot.identifiable(max_delay_s).parameters.terms
-    changed = (drift.named or drift.likely) if drift is not None else None
-    offered = {p.name: p.term for p in watched(robot, max_delay_s).parameters}
-    added = offered.get(changed.name, "") if changed is not None else ""
+    if usual.terms in ("auto", "all"):
+        return usual.terms
+    default = robot.identifiable(usual.max_delay_s).parameters.terms
     before = default if (used := identification.used_terms) is None else used
+    changed = None if drift is None else drift.named or drift.likely
+    offered = {p.name: p.term for p in watched(robot, usual.max_delay_s).parameters}
+    added = "" if changed is None else offered.get(changed.name, "")
     terms = (*before, added) if added and added not in before else before
-    return configured if terms == default else ",".join(terms) or "none"
+    return usual.terms if terms == default else ",".join(terms) or "none"
 
 
 def logs_to_identify(
