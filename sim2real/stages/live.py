@@ -33,6 +33,8 @@ _START_S = 30.0
 _END_S, _LEAVE_S = 5.0, 1.0
 """Longest waits for the last rows after the stage, and for the end of the process [s]."""
 _NICENESS = 10
+_READY, _WHOLE = "view:", "all rows are sent"
+"""The process's first line and its last one, if nothing goes wrong."""
 
 
 def scene_of(robot: RecordedRobot) -> dict[str, Json]:
@@ -65,19 +67,12 @@ def live_view(target: str | None, folder: Path, name: str, scene: Callable[[], M
         name: Name of the application in the viewer, which keeps one arrangement for each.
         scene: Returns the robot to draw in 3-D, see ``scene_of``.
     """
-    process = None if target is None else _started(target, folder, name, scene())
-    try:
+    if target is None:
         yield
-    finally:
-        if process is not None:
-            _end(process)
-
-
-def _started(target: str, folder: Path, name: str, scene: Mapping[str, Json]) -> subprocess.Popen[str] | None:
-    """Start the process, and wait until its viewer is open; None if it does not open."""
+        return
     is_file = target.endswith(".rrd") and "://" not in target
     where = str(Path(target).absolute()) if is_file else target
-    order = {"target": where, "folder": str(Path(folder).absolute()), "name": name, **scene}
+    order = {"target": where, "folder": str(Path(folder).absolute()), "name": name, **scene()}
     # In a session of its own, as Ctrl-C ends the stage, and the last rows come after it.
     process = subprocess.Popen(
         [sys.executable, "-m", "sim2real.stages.live"],
@@ -90,54 +85,34 @@ def _started(target: str, folder: Path, name: str, scene: Mapping[str, Json]) ->
     )
     with suppress(OSError):
         print(json.dumps(order), file=process.stdin, flush=True)
-    message = _message(process, _START_S)
-    if "line" in message:
-        note(f"view: {message['line']}", urgent=True)
-        return process
-    silent = f"hangs for {_START_S:g} s" if process.poll() is None else "ended"
-    note(f"warning: no live view: {message.get('error') or f'its process {silent}'}")
-    if message.get("hint"):
-        note(f"hint: {message['hint']}")
-    _stop(process)
-    return None
-
-
-def _end(process: subprocess.Popen[str]) -> None:
-    """Let the process send the last rows; warn if it has failed."""
-    if process.stdin is not None:
-        with suppress(OSError):
-            process.stdin.close()  # the process then sends the last rows, and ends
-    message = _message(process, _END_S)
-    problem = message.get("error")
-    if not message:
-        problem = f"its process {'ended early' if process.poll() is not None else 'hangs'}"
-    elif message.get("dropped"):
-        problem = f"the viewer did not take {message['dropped']} updates"
-    if problem:
-        note(f"warning: the live view is not whole: {problem}; the stage and its files are")
-    _stop(process)
-
-
-def _stop(process: subprocess.Popen[str]) -> None:
-    with suppress(subprocess.TimeoutExpired):
-        process.wait(_LEAVE_S)
-    process.kill()
-    process.wait()
-    for pipe in (process.stdin, process.stdout):
-        if pipe is not None:
+    # Wait until the viewer is open: it must not take the processor while torque is on.
+    ready = _line(process, _START_S)
+    note(ready or "warning: no live view: its process does not answer", urgent=True)
+    try:
+        yield
+    finally:
+        if process.stdin is not None:
             with suppress(OSError):
+                process.stdin.close()  # the process then sends the last rows, and ends
+        last = _line(process, _END_S)
+        if ready.startswith(_READY) and last != _WHOLE:
+            note(last or "warning: the live view is not whole: its process ended early; the stage and its files are")
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(_LEAVE_S)
+        process.kill()
+        process.wait()
+        for pipe in (process.stdin, process.stdout):
+            if pipe is not None:
                 pipe.close()
 
 
-def _message(process: subprocess.Popen[str], wait_s: float) -> Mapping[str, Json]:
-    """Return the next message of the process; empty if none comes in time."""
-    if process.stdout is None or not select.select([process.stdout], [], [], wait_s)[0]:
-        return {}
-    line = process.stdout.readline()
-    return json.loads(line) if line.startswith("{") else {}
+def _line(process: subprocess.Popen[str], wait_s: float) -> str:
+    """Return the next line of the process; "" if none comes in time."""
+    out = process.stdout
+    return out.readline().strip() if out is not None and select.select([out], [], [], wait_s)[0] else ""
 
 
-# -- the process: it feeds the viewer until its standard input closes
+# -- the process: it feeds the viewer until its standard input closes; it prints a line at its start and one at its end
 
 
 def main() -> None:
@@ -152,19 +127,15 @@ def main() -> None:
     order = json.loads(sys.stdin.readline())
     try:
         recording = rerun_module().RecordingStream(f"sim2real {order['name']}")
-        line = open_viewer(recording, order["target"])
+        print(f"{_READY} {open_viewer(recording, order['target'])}", flush=True)
         follower = Follower(recording, lambda: [Path(order["folder"])], drawn(order))
-        _report(line=line)
         while not select.select([sys.stdin], [], [], PERIOD_S)[0]:
             follower.poll()
         follower.poll()
-        _report(dropped=follower.close())
+        dropped = follower.close()
+        print(f"warning: the viewer did not take {dropped} updates" if dropped else _WHOLE, flush=True)
     except Sim2RealError as error:
-        _report(error=error.args[0], hint=error.hint)
-
-
-def _report(**message: Json) -> None:
-    print(json.dumps(message), flush=True)
+        print(f"warning: no live view: {error.args[0]}{f'; hint: {error.hint}' if error.hint else ''}", flush=True)
 
 
 # -- viewers that a command keeps open
