@@ -351,7 +351,7 @@ def _shown(pairs: Sequence[ComparedSeries]) -> list[ComparedSeries]:
 
 
 def _scores(episode: EpisodeRow) -> str:
-    """Return the scores of an episode as a sentence."""
+    """Return the scores of an episode, its late steps and its pauses as a sentence."""
     both = [
         f"{label}: robot {number(value, 3)}"
         + (f", simulation {number(episode.simulation[n], 3)}" if n in episode.simulation else "")
@@ -359,6 +359,8 @@ def _scores(episode: EpisodeRow) -> str:
         for n, value in episode.real.items()
         for label, unit in [words_and_unit(n)]
     ]
+    both += [f"late steps of {node}: {share:.1%}" for node, share in episode.late.items() if share]
+    both += [f"lost in pauses: {episode.paused_s:.2g} s"] if episode.paused_s else []
     text = "; ".join(both)
     return text[:1].upper() + text[1:] + "." if both else ""
 

@@ -169,12 +169,17 @@ def test_a_log_that_was_cut_is_shown_with_a_note(only):
     assert "actuator.action [V]" in text
 
 
-def test_a_deployment_without_a_simulation_is_shown(run):
-    (run / "deploy" / "result.json").write_text(json.dumps(synthetic_run.result(simulated=False)))
+def test_a_deployment_without_a_simulation_is_shown_with_late_steps_and_pauses(run):
+    result = synthetic_run.result(simulated=False)
+    result["episodes"][1] = {**result["episodes"][0], "late": {"agent": 0.032, "sensor": 0.0}, "paused_s": 0.4}
+    (run / "deploy" / "result.json").write_text(json.dumps(result))
     np.savez(run / "deploy" / "simulation.npz")
-    words = Page(report(run).read_text(encoding="utf-8")).words
+    text = report(run).read_text(encoding="utf-8")
+    words = Page(text).words
     assert {"first upright", "1.375"} <= set(words)
     assert "1.340" not in words
+    assert text.count("late steps of agent: 3.2%; lost in pauses: 0.4 s.</figcaption>") == 1
+    assert "late steps of sensor" not in text
 
 
 def test_a_dry_run_is_shown_without_a_simulation(only):
