@@ -176,6 +176,16 @@ def test_stamps_units_and_rates(tmp_path):
     assert imported(path, rate_hz=200.0)[0].metadata["stamps"] == {"actuator": "generated", "sensor": "generated"}
 
 
+def test_stamps_that_step_back_are_refused_with_the_place_and_a_part_is_imported(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    csv(tmp_path / "run.csv", {"t_s": np.where(T > 6, T - 6, T), "goal_a_rad": GOAL[:, 0], "q_a_rad": Q[:, 0]})
+    with pytest.raises(UsageError, match="before sample 1201"):
+        proposed(tmp_path / "run.csv")
+    assert cli.main(["import", "run.csv", "--samples", "0:1201", "--out", "part.mcap"]) == 0
+    assert len(read_log("part.mcap").steps["sensor"]) == 1201
+    assert imported(tmp_path / "run.csv", rate_hz=200.0)[1].questions == {}
+
+
 def test_gains_torque_switches_and_velocities_go_along(tmp_path):
     on = (T > 1.0).astype(float)
     rate = np.gradient(Q, T, axis=0)

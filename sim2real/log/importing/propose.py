@@ -342,8 +342,17 @@ class Proposal:
                 rate_hz = value if s.meaning.quantity == "rate" else 1.0 / (value * (1.0 if value < 1.0 else 1e-3))
                 reason = f"{s.name!r} in the file"
                 break
+        for s in named if rate_hz is None else ():
+            values = s.values[np.isfinite(s.values[:, 0]), 0]
+            if back := np.flatnonzero(np.diff(values) < 0).tolist():
+                k = back[0] + 1
+                raise UsageError(
+                    f"the stamps {s.name!r} in {self.table.path} step back before sample {k}, from "
+                    f"{values[k - 1]:.15g} to {values[k]:.15g}: two recordings in one file, or a clock that was set",
+                    hint=f"import a part: --samples 0:{k} or {k}:; --rate-hz spaces all samples evenly",
+                )
         if rate_hz is None:
-            why = f"the stamps {named[0].name!r} repeat or step back" if named else "the file has no time stamps"
+            why = f"the stamps {named[0].name!r} repeat" if named else "the file has no time stamps"
             self.questions[node, "", "rate_hz"] = f"?  # samples per second: {why}; --rate-hz answers, too"
         self.reasons[node, "", "rate_hz"] = reason
         return {"rate_hz": rate_hz or 1.0}, np.arange(count) / (rate_hz or 1.0)

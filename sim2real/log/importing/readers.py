@@ -11,7 +11,7 @@ import zipfile
 import zlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -81,6 +81,12 @@ class Table:
     def keys(self) -> list[str]:
         """Names of all signals."""
         return [*self.columns, *self.words, *self.broken]
+
+    def cut(self, samples: slice) -> Table:
+        """Return a range of samples of all signals that are as long as the longest one."""
+        longest = max((len(v) for v in self.columns.values() if v.ndim), default=0)
+        columns = {n: v[samples] if v.ndim and len(v) == longest else v for n, v in self.columns.items()}
+        return replace(self, columns=columns)
 
     def add(self, name: str, raw: object) -> None:
         """Add a signal: an array of numbers, dates or words."""

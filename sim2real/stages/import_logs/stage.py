@@ -43,7 +43,8 @@ def run(config: ImportConfig) -> None:
         # Read the file by the mapping; propose a mapping for the first file if there is none.
         if mapping is None:
             hints = hints_of(config)
-            mapping, text = proposed(tables[0], hints, config.out)
+            part = tables[0] if config.selection is None else tables[0].cut(config.selection)
+            mapping, text = proposed(part, hints, config.out)
             joints, checked = hints.joints, 1
         else:
             checked = 0
