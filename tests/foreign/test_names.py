@@ -199,10 +199,18 @@ def test_gains_torque_switches_and_velocities_go_along(tmp_path):
     assert any("'kd'" in line for line in found.evidence)
 
 
-def test_a_gain_that_is_logged_rarely_drops_no_commands(tmp_path):
+def test_a_gain_that_is_logged_rarely_drops_no_commands(tmp_path, monkeypatch):
     kp = np.where(np.arange(len(T)) % 25 == 0, 8.0, np.nan)
+    path = table(tmp_path, kp=kp)
     with pytest.raises(UsageError, match="kp"):
-        proposed(table(tmp_path, kp=kp))
+        proposed(path)
+    # The mapping is there to be edited.
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["import", path.name]) == 2
+    edit = tmp_path / "run.import.toml"
+    edit.write_text(edit.read_text().replace('[nodes.actuator.fields.kp]\nsource = ["kp"]  # by its name\n', ""))
+    assert cli.main(["import", path.name, "--mapping", edit.name, "--out", "log.mcap"]) == 0
+    assert set(read_log("log.mcap").outputs["actuator"]) == {"goal"}
 
 
 def test_names_of_files_of_one_recording_are_no_joints(tmp_path):

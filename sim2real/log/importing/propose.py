@@ -85,7 +85,6 @@ class ImportHints:
     calibration: Path | None = None
 
 
-@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # damaged files can hold numbers of any size
 def propose(table: Table, hints: ImportHints) -> Proposal:
     """Return the mapping that names and units give, checked against the data.
 
@@ -133,8 +132,13 @@ class Proposal:
             for (node, name, key), text in self.questions.items()
         )
 
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # damaged files can hold numbers of any size
     def complete(self) -> None:
-        """Propose the mapping, and check it."""
+        """Propose the mapping, and check it.
+
+        Raises:
+            UsageError: As ``propose``; if the data contradict the mapping, it is complete.
+        """
         # Which columns are the positions and the commands, and of which joints.
         measured = self.choose("measured", self.signals)
         command = self.choose("command", [s for s in self.signals if s is not measured], measured)
@@ -344,7 +348,8 @@ class Proposal:
                 break
         for s in named if rate_hz is None else ():
             values = s.values[np.isfinite(s.values[:, 0]), 0]
-            if back := np.flatnonzero(np.diff(values) < 0).tolist():
+            back = np.flatnonzero(np.diff(values) < 0).tolist()
+            if 0 < len(back) < 0.1 * len(values):
                 k = back[0] + 1
                 raise UsageError(
                     f"the stamps {s.name!r} in {self.table.path} step back before sample {k}, from "
@@ -352,7 +357,7 @@ class Proposal:
                     hint=f"import a part: --samples 0:{k} or {k}:; --rate-hz spaces all samples evenly",
                 )
         if rate_hz is None:
-            why = f"the stamps {named[0].name!r} repeat" if named else "the file has no time stamps"
+            why = f"the stamps {named[0].name!r} repeat or step back" if named else "the file has no time stamps"
             self.questions[node, "", "rate_hz"] = f"?  # samples per second: {why}; --rate-hz answers, too"
         self.reasons[node, "", "rate_hz"] = reason
         return {"rate_hz": rate_hz or 1.0}, np.arange(count) / (rate_hz or 1.0)

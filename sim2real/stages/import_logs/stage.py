@@ -13,7 +13,7 @@ from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
 from sim2real.log.importing import checks, importer
 from sim2real.log.importing.mapping import MAPPING, ImportMapping, load_mapping
-from sim2real.log.importing.propose import ImportHints, Proposal, propose
+from sim2real.log.importing.propose import ImportHints, Proposal
 from sim2real.log.importing.readers import Table, joined, open_tables
 from sim2real.robots.model.drives import joints_of, slides_of
 from sim2real.robots.model.file import read_model
@@ -140,37 +140,40 @@ def proposed(table: Table, hints: ImportHints, out: Path | None = None) -> tuple
         out: The log; open questions are written beside it, else into the working directory.
 
     Raises:
-        UsageError: When the mapping has open questions, which are written into a file.
+        UsageError: When the mapping has open questions, or the data contradict it; it is written into a file to edit.
     """
+    proposal = Proposal(table, hints)
     try:
-        proposal = propose(table, hints)
-    except UsageError:
+        proposal.complete()
+    except UsageError as error:
         for line in table.notes:  # a signal that the file's reader omitted may be the cause
             note(line)
-        raise
+        if not proposal.mapping.nodes:
+            raise
+        edit = _write_to_edit(proposal.toml(), table.path, out)
+        raise UsageError(str(error.args[0]), hint="; or ".join(filter(None, [error.hint, f"edit {edit}"]))) from None
     text = proposal.toml()
     note(f"proposed mapping for {table.path.name}:")
     for line in text.splitlines():
         note(f"  {line}".rstrip())
     if proposal.questions:
-        raise _open_questions(proposal, table.path, text, out)
+        said = f"the names in {table.path} leave open: {proposal.open_questions()}"
+        raise UsageError(said, hint=f"answer in {_write_to_edit(text, table.path, out)}")
     return proposal.mapping, text
 
 
-def _open_questions(proposal: Proposal, path: Path, text: str, out: Path | None) -> UsageError:
-    """Write a proposed mapping with its open questions, and return the error that lists them."""
+def _write_to_edit(text: str, path: Path, out: Path | None) -> str:
+    """Write a mapping that needs an edit; return the file's name and the command that takes it, as a hint."""
     file = out.with_suffix(".import.toml") if out is not None else Path(f"{path.stem}.import.toml")
-    said = f"the names in {path} leave open: {proposal.open_questions()}"
     if file.is_file() and file.read_text(encoding="utf-8", errors="replace") != text:
-        return UsageError(said, hint=f"{file} exists with other content: answer there, or remove it")
+        return f"{file}, which exists with other content, or remove it"
     try:
         file.write_text(text, encoding="utf-8")
     except OSError as error:
-        return UsageError(said, hint=f"{file} cannot be written: {error.strerror}")
+        return f"{file}, which cannot be written: {error.strerror}"
     words = sys.argv[1:]
-    taking = words[:1] and words[0] in ("import", "identify", "check", "new")
-    command = shlex.join(["sim2real", *words]) if taking else f"sim2real import {path}"
-    return UsageError(said, hint=f"answer in {file}, then {command} --mapping {file}")
+    command = shlex.join(["sim2real", *words]) if words[:1] in (["import"], ["new"]) else f"sim2real import {path}"
+    return f"{file}, then {command} --mapping {file}"
 
 
 def refuse_contradictions(path: Path, episode: Episode, as_told: bool, joints: Sequence[str] = ()) -> None:
