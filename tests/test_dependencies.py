@@ -24,6 +24,7 @@ MAY_IMPORT = {
     "view": {"sim2real.view.rerun_recording", "sim2real.view.rerun_viewer", "sim2real.view.model_scene"},
     "hardware": {"sim2real.policy.runner"},
     "interop": {"sim2real.interop.brax", "sim2real.interop.vector"},
+    "network": {"sim2real.training.networks.onnx_export"},
     "parquet": {"sim2real.log.importing.lerobot"},
     "unitree": {"sim2real.hardware.unitree.dds", "sim2real.hardware.unitree.messages"},
     "warp": set(),  # MJX imports Warp itself

@@ -76,17 +76,17 @@ def translate(step: Callable[..., PyTree], shapes: Sequence[tuple[int, ...]], ne
         UsageError: jax2onnx is not installed, or does not translate the network.
     """
     try:
-        from jax2onnx import to_onnx  # pyright: ignore[reportMissingImports]  # importing it takes seconds
+        from jax2onnx import to_onnx  # importing it takes seconds
     except ImportError as error:
         raise UsageError(
             f"network {network} is exported to ONNX by jax2onnx, which is not installed", hint=with_extra("network")
         ) from error
     inputs = [jax.ShapeDtypeStruct((1, *shape), jnp.float32) for shape in shapes]
     carry = [f"carry_{i}" for i in range(len(shapes) - 1)]
-    names = {"input_names": ["observation", *carry], "output_names": ["action", *(f"next_{name}" for name in carry)]}
+    names, after = ["observation", *carry], ["action", *(f"next_{name}" for name in carry)]
     traced = jaxpr_as_fun(jax.make_jaxpr(step)(*inputs))  # it does not trace a module of flax under `vmap`
     try:
-        return to_onnx(traced, inputs, model_name="policy", opset=OPSET, **names)
+        return to_onnx(traced, inputs, model_name="policy", opset=OPSET, input_names=names, output_names=after)
     except Exception as error:  # its errors share no base class
         raise UsageError(
             f"network {network} is not exported to ONNX, so no robot could run it: {error}",

@@ -439,8 +439,9 @@ def make_initial_state(
     keys = _keys(np.tile(key_data, (len(configs), 1)), key)
     # The share of a curriculum that follows success.
     follows = env.curriculum is not None and env.follow > 0.0
-    reached = np.full(members, env.curriculum[0], np.float32) if env.curriculum is not None and follows else None
-    return TrainState(params, optimiser, normaliser, privileged, copies, np.zeros(members, np.int32), keys, reached)
+    shares = np.full(members, env.curriculum[0], np.float32) if env.curriculum is not None and follows else None
+    update, reached = jax.device_put((np.zeros(members, np.int32), shares))
+    return TrainState(params, optimiser, normaliser, privileged, copies, update, keys, reached)
 
 
 def swept_numbers(sweep: Sweep, num_seeds: int) -> dict[str, Array]:
