@@ -13,7 +13,6 @@ from sim2real.commands import flags
 from sim2real.commands.stages import DEMO_PIPELINE
 from sim2real.errors import Sim2RealError
 from sim2real.hardware import registry
-from sim2real.installation import has_jax
 from sim2real.runtime import compilation_cache
 from sim2real.stages.flag import Flag
 from sim2real.stages.load import available, folder_of, load_robot, summary_of
@@ -62,15 +61,9 @@ def installation() -> str:
 
 
 def _programs() -> str:
-    """Return where compiled programs are kept, and how much there is of them."""
-    if (configured := os.environ.get("JAX_COMPILATION_CACHE_DIR")) is not None:
-        return f"{configured} (JAX_COMPILATION_CACHE_DIR)"
-    folder = compilation_cache.location()
-    if not has_jax():
-        return "none: JAX is not installed"
-    if folder is None:
-        return f"not kept: {compilation_cache.VARIABLE} is {compilation_cache.OFF}"
-    return f"{shown(folder)}, {compilation_cache.size_bytes(folder) / 1e6:.0f} MB"
+    """Return where compiled programs are kept."""
+    folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or compilation_cache.location()
+    return f"not kept: {compilation_cache.VARIABLE} is {compilation_cache.OFF}" if folder is None else shown(folder)
 
 
 def pipeline(name: str, root: Path) -> str:

@@ -25,6 +25,7 @@ _COMMANDS = {
     "duty": ("duty",),
     "mit": ("goal", "goal_velocity", "torque", "kp", "kd"),
 }
+_PIPELINES = Path("pipelines")
 _SILENCE_S = 1.0  # torque is off, so a lost answer is no danger
 _OF_MODEL = {
     "__init__.py": '''"""Recorded robot of {joints} joints, identified from its model."""
@@ -89,8 +90,6 @@ class NewConfig:
     then records and identifies it."""
     port: Annotated[str | None, Flag("PORT")] = None
     """Serial port of the robot, for --like."""
-    folder: Path = Path("pipelines")
-    """Folder of pipelines."""
     runs: Path = Path("runs")
     """Folder of all runs, for --like."""
 
@@ -127,7 +126,7 @@ def _from_model(config: NewConfig) -> None:
     _check_name(config.name, example)
     if config.robot.mjcf is None:
         raise UsageError("new needs a model of the robot: --mjcf", hint=example)
-    folder = config.folder / config.name
+    folder = _PIPELINES / config.name
     if folder.exists():
         raise UsageError(f"{folder} exists", hint="choose another name, or delete it")
     # Describe the robot by its log; without one, by the flags alone.
@@ -191,12 +190,9 @@ def _run_like(config: NewConfig, like: str) -> bool:
     _check_name(config.name, example)
     if config.port is None or config.robot.mjcf is not None or config.log is not None:
         raise UsageError("--like needs the --port of the robot, and neither a model nor a log", hint=example)
-    if config.folder.resolve() != Path("pipelines").resolve() or config.name in sources:
-        raise UsageError(
-            f"the pipeline {config.name!r} exists already, or --folder is not ./pipelines",
-            hint="choose another name, or delete it",
-        )
-    folder = config.folder / config.name
+    if config.name in sources:
+        raise UsageError(f"the pipeline {config.name!r} exists already", hint="choose another name, or delete it")
+    folder = _PIPELINES / config.name
     with tempfile.TemporaryDirectory() as temporary:
         # Find faults of the arm before a motor moves.
         calibration = Path(temporary) / "calibration.json"

@@ -74,11 +74,6 @@ def enable() -> Path | None:
     return folder
 
 
-def size_bytes(folder: Path) -> int:
-    """Return the size of all programs in a folder."""
-    return sum(size for _, size, _ in _entries(folder))
-
-
 def _machine() -> str:
     """Return a name for machines that can run each other's programs: processor features, Python's and JAX's versions.
 
