@@ -189,20 +189,10 @@ def _episode_blocks(artifact: StageFolder) -> list[Block]:
     caption = "Each episode draws its own parameters, computation times and noise."
     if drawn.widening > 1.0:
         caption += f" The posterior's deviations are multiplied by {drawn.widening:.1f}, to cover errors of the model."
-    # Describe pauses, pushes and the curriculum if there are any.
     if drawn.cut or drawn.again:
         caption += (
             f" {drawn.cut} of {drawn.timelines} timelines end before a pause of the computer that is too long for the "
             f"training; {drawn.again} were drawn again, as the pause was in their first half."
-        )
-    if drawn.push_hz:
-        caption += f" Each joint is pushed {drawn.push_hz:g} times a second, at random times."
-    if drawn.curriculum != (1.0, 1.0):
-        first, last = drawn.curriculum
-        follow = f" while success is above {drawn.follow:g}" if drawn.follow else ""
-        caption += (
-            f" The share of all differences grows from {first:g} to {last:g} in training{follow}; the tables show "
-            f"{last:g}."
         )
     tables = {
         "Parameters of the episodes": drawn.rows(),

@@ -89,9 +89,7 @@ ROLES = {
     "measured": Role(INK, DASHES[0], 1.5, 3.0),
     "identified": Role(BLUE, DASHES[1], 1.5, 4.0),
     "without delays": Role(MUTED, DASHES[2], 1.0, 2.2),
-    "nominal": Role(ORANGE, DASHES[2], 1.4, 2.5),
     "truth": Role(GREEN, DASHES[3], 1.3, 2.0),
-    "interval": Role(BLUE, DASHES[2], 0.7, 1.0),
     "residual": Role(BLUE, DASHES[0], 1.2, 3.0),
     "command": Role(PURPLE, DASHES[0], 1.0, 3.0),
 }
