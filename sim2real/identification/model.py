@@ -92,12 +92,17 @@ class IdentifiableModel(Protocol):
         """Return sensor, given nodes and world, connected with trainable delays up to ``max_delay_s``."""
         ...
 
-    def reached(self, recordings: Sequence[Episode]) -> Mapping[str, float]:
-        """Return limit -> the largest value that recordings reach, of limits among the optional terms."""
-        ...
-
     def params(self, values: Mapping[str, Array], start: Array) -> dict[str, PyTree]:
         """Return node parameters for values and an initial state ``(2 * channels,)``: positions, then velocities."""
+        ...
+
+
+@runtime_checkable
+class HasLimits(Protocol):
+    """A model with limits among its optional terms."""
+
+    def reached(self, recordings: Sequence[Episode]) -> Mapping[str, float]:
+        """Return limit -> the largest value that recordings reach."""
         ...
 
 

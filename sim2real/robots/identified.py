@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from sim2real import pytree
 from sim2real.graph.delays import TrainableDist
-from sim2real.graph.episode import Episode, named_leaves
+from sim2real.graph.episode import named_leaves
 from sim2real.graph.node import BaseNode
 from sim2real.identification.model import Channel
 from sim2real.identification.parameters import Parameter, ParameterTable
@@ -105,10 +105,6 @@ class IdentifiableRecording:
         tick_s = robot.tick_s
         sensor.connect(world, delay_dist=TrainableDist.create(tick_s, 0.0, 2 * tick_s, "linear") if tick_s else None)
         return {n.name: n for n in (sensor, actuator, world)}
-
-    def reached(self, recordings: Sequence[Episode]) -> Mapping[str, float]:
-        """Return an empty dict: there are no limits among the optional terms."""
-        return {}
 
     def params(self, values: Mapping[str, Scalar], start: PyTree) -> dict[str, PyTree]:
         """Return node parameters.

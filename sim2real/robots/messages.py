@@ -2,7 +2,7 @@
 
 from sim2real import pytree
 from sim2real.graph.base import Base
-from sim2real.types import Array
+from sim2real.types import Array, PyTree
 
 
 @pytree.dataclass
@@ -11,11 +11,11 @@ class JointReading(Base):
 
     Attributes:
         position: Shape ``(joints,)`` [rad].
-        velocity: Shape ``(joints,)`` [rad/s].
+        velocity: Shape ``(joints,)`` [rad/s]; None: it is not measured.
     """
 
     position: Array
-    velocity: Array
+    velocity: PyTree = None
 
 
 @pytree.dataclass

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Unpack
 
@@ -12,7 +12,7 @@ import numpy as np
 from sim2real import pytree
 from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.delays import DelayDistribution
-from sim2real.graph.episode import Episode, named_leaves
+from sim2real.graph.episode import named_leaves
 from sim2real.graph.node import BaseNode, NodeOptions
 from sim2real.identification.parameters import ParameterTable
 from sim2real.later import jax, jnp
@@ -257,10 +257,6 @@ class IdentifiableLoop:
         robot, world = self._robot, self._robot.model.make_world(resumed=True)
         sensor = SimSensor(SENSOR, robot.drive.rate_hz, world)
         return recorded_loop(sensor, _sim_actuator(robot), world, max_delay_s, self.ahead_s, _lead_s(world))
-
-    def reached(self, recordings: Sequence[Episode]) -> Mapping[str, float]:
-        """Return an empty dict: there are no limits among the optional terms."""
-        return {}
 
     def params(self, values: Mapping[str, Scalar], start: Array) -> dict[str, PyTree]:
         """Return the nodes' parameters.

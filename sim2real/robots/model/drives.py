@@ -17,6 +17,7 @@ from sim2real.errors import UsageError
 from sim2real.graph.base import Base, GraphState, StepState, Value
 from sim2real.graph.node import BaseNode
 from sim2real.identification.model import PlainSimulation, converged
+from sim2real.robots.messages import JointReading
 from sim2real.robots.model.file import one_line, read_spec
 from sim2real.robots.model.held import Holding, apply, plan
 from sim2real.types import Array, Json, Key, MjModel, MjSpec, PyTree, Scalar
@@ -275,14 +276,6 @@ def with_payload_of(model: MjModel, sent: Mapping[str, np.ndarray]) -> MjModel:
     return model
 
 
-@pytree.dataclass
-class Measured(Base):
-    """Readings of the encoders, each of shape ``(joints,)`` [rad, rad/s]; None without a velocity."""
-
-    position: Array
-    velocity: Array | None = None
-
-
 class Encoders(BaseNode):
     """Reads the joints of a ``DrivenWorld``.
 
@@ -298,20 +291,20 @@ class Encoders(BaseNode):
         world = self._world.init_params(rng, graph_state)
         return EncoderParams(jnp.zeros(len(self._world.qpos_at)), world.terms)
 
-    def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> Measured:
+    def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> JointReading:
         del rng, graph_state
         still = jnp.zeros(len(self._world.qpos_at))
-        return Measured(still, still if self._velocity else None)
+        return JointReading(still, still if self._velocity else None)
 
     def init_delays(self, rng: Key | None = None, graph_state: GraphState | None = None) -> dict[str, Value]:
         return delay_of(self.name, self._world.name, graph_state)
 
-    def step(self, step_state: StepState) -> tuple[StepState, Measured]:
+    def step(self, step_state: StepState) -> tuple[StepState, JointReading]:
         message, params = step_state.inputs[self._world.name][-1].data, step_state.params
         angle, speed = message.qpos[self._world.qpos_at], message.qvel[self._world.qvel_at]
         if params.terms is not None:
             angle, speed = params.terms.read(angle), params.terms.rate(angle, speed)
-        return step_state, Measured(angle + params.zero, speed if self._velocity else None)
+        return step_state, JointReading(angle + params.zero, speed if self._velocity else None)
 
 
 @pytree.dataclass

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -63,11 +63,6 @@ class LegsInAStand:
         command = DriveCommand(goal=still, goal_velocity=still, torque=still, kp=still, kd=still)
         actuator = RecordedActuator(ACTUATOR, self._rate_hz, command)
         return recorded_loop(sensor, actuator, world, max_delay_s, self.ahead_s, world.lead_s)
-
-    def reached(self, recordings: Sequence[Episode]) -> Mapping[str, float]:
-        """Return an empty dict: there are no limits among the optional terms."""
-        del recordings
-        return {}
 
     def check(self, episode: Episode) -> None:
         """Refuse a log in which the base turns: it was not in a stand.

@@ -12,7 +12,7 @@ from sim2real.artifacts.run import Source, portable
 from sim2real.errors import OtherMotion
 from sim2real.graph.episode import Episode
 from sim2real.identification.delays import measured
-from sim2real.identification.model import IdentifiableModel, measured_channels
+from sim2real.identification.model import HasLimits, IdentifiableModel, measured_channels
 from sim2real.identification.parameters import ParameterTable
 from sim2real.identification.segments import Span
 from sim2real.robots.robot import RecordedRobot, Robot, in_world
@@ -166,7 +166,7 @@ def table_of(model: IdentifiableModel, config: IdentifyConfig, episodes: Sequenc
         episodes: The fitted recordings: bounds of limits among the terms follow from what they reach.
     """
     bounded = model.parameters.with_bounds(config.bounds)
-    if config.terms not in ("own", "none"):
+    if isinstance(model, HasLimits) and config.terms not in ("own", "none"):
         bounded = bounded.with_reached(model.reached(episodes))
     table = with_wanted_terms(bounded, config.terms).with_fixed(config.fix)
     # A data sheet's delay of one side fixes how the delay is shared: then the other side's is identified.
