@@ -12,8 +12,8 @@ from sim2real.training.sweep import Sweep
 
 
 @dataclass(frozen=True)
-class LearningConfig:
-    """Settings of learning."""
+class TrainConfig:
+    """Train a policy on the identified model with the robot's timing."""
 
     resume: Annotated[str | None, Flag("RUN|newest")] = None
     """Interrupted training to continue: its folder, its run, or 'newest' for the pipeline's newest."""
@@ -26,16 +26,6 @@ class LearningConfig:
     """Several processes, on this host or others, that make one training."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
     """The learning algorithm."""
-
-    def __post_init__(self) -> None:
-        """Check the sweep."""
-        Sweep.parse(self.sweep).configs(self.ppo)
-
-
-@dataclass(frozen=True)
-class TrainConfig(LearningConfig):
-    """Train a policy on the identified model with the robot's timing."""
-
     model: Literal["identified", "nominal"] = "identified"
     """Parameters to train on: the estimates of identify, or the nominal ones without any delay."""
     parameters: Annotated[str | None, Flag("FILE")] = None
@@ -61,7 +51,7 @@ class TrainConfig(LearningConfig):
 
     def __post_init__(self) -> None:
         """Check the settings before anything is compiled."""
-        super().__post_init__()
+        Sweep.parse(self.sweep).configs(self.ppo)
         check_seed(self.seed)
         if self.timelines < 1 or not 0.5 <= self.episode_s <= 600.0:
             raise UsageError(
