@@ -191,6 +191,26 @@ def test_bare_commands_of_a_page_exist(page):
     assert {line: flags for line in mine if (flags := unknown_flags(f"sim2real {line}"))} == {}
 
 
+@functools.cache
+def all_flags() -> str:
+    """Return the help of all commands, of two robots, and the code of the benches; ``--no-x`` is the flag ``--x``."""
+    of_robots = [help_of(stage, robot) for stage in ("record", "train", "deploy") for robot in ("pendulum", "go2")]
+    benches = [path.read_text() for path in (ROOT / "scripts").rglob("*.py")]
+    return "\n".join([*map(help_of, COMMANDS), *of_robots, *benches])
+
+
+def test_flags_in_backticks_exist():
+    quoted = {q: page.name for page in PAGES for q in re.findall(r"`(--[^`]*)`", without_code(page.read_text()))}
+    named = {(page, flag) for q, page in quoted.items() for flag in re.findall(r"--[a-z][\w.-]*", q)}
+    wrong = [
+        (page, flag)
+        for page, flag in sorted(named - {("robot_computer.md", "--no-deps")})  # pip's
+        if not re.search(rf"{flag.replace('--no-', '--').replace('.no-', '.')}(?![\w-])", all_flags())
+    ]
+    assert wrong == []
+    assert not re.search("--no-such-flag", all_flags())
+
+
 def test_tables_and_backticks_with_commands_that_do_not_exist_are_found():
     page = "| command | does |\n|---|---|\n| `compare`, `sim2real info` | `x` |\n\n`train --sead 1`, `x`\n"
     assert commands_of(page) == {"compare", "info", "train --sead 1"}
