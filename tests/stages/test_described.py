@@ -64,6 +64,20 @@ def test_a_later_log_is_read_by_the_mapping_of_the_pipeline(workplace, recorded)
     assert log.episode.outputs["sensor"]["position"].shape == q.shape
 
 
+def test_a_later_log_that_contradicts_the_mapping_is_named(workplace, recorded, capsys):
+    assert cli.main(NEW) == 0
+    t, goal, q = recorded
+    np.savez("swapped.npz", t_s=t, q_rad=q, goal_rad=goal[:, ::-1])
+    pipeline = load_robot("rig")
+    open_recording(Path("run.npz"), pipeline)
+    assert "contradict" not in capsys.readouterr().err
+    open_recording(Path("swapped.npz"), pipeline)
+    told = capsys.readouterr().err
+    assert (
+        "warning: swapped.npz and its mapping contradict each other: pan_joint follows the goal of lift_joint" in told
+    )
+
+
 def test_check_says_of_a_joint_that_stands_still_what_to_record(workplace, capsys, recorded):
     t, goal, q = recorded
     noise = 1e-3 * np.random.default_rng(0).standard_normal(q.shape)

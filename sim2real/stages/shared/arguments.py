@@ -16,6 +16,7 @@ from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.identification.segments import require_moved
+from sim2real.log.importing import checks
 from sim2real.log.importing.importer import import_file
 from sim2real.log.schema import unit_of
 from sim2real.robots.identified import LoggedRobot
@@ -145,11 +146,17 @@ def _loaded(value: Any, kind: type[T], name: str, expected: str, hint: str) -> T
 def open_recording(path: Path, robot: RecordedRobot) -> Recording:
     """Read a log of a robot, in its units; a log that was cut is used as far as it goes.
 
-    A file of another recorder is imported in memory, if the robot has a mapping for it.
+    A file of another recorder is imported in memory, if the robot has a mapping for it; a warning names what its data
+    contradict.
     """
     if (mapping := mapping_of(robot, path)) is not None:
         recording = Recording(path, import_file(path, mapping))
         _require_fitting(recording, robot)
+        sensor: Any = getattr(robot, "sensor", robot)  # a recorded robot has no sensor
+        found = checks.check_episode(recording.episode, [c.label for c in sensor.channels])
+        if wrong := [f.text for f in found if f.weight == "refuse"]:
+            more = f"; {len(wrong) - 3} more" if len(wrong) > 3 else ""
+            note(f"warning: {path.name} and its mapping contradict each other: {'; '.join(wrong[:3])}{more}")
         return recording
     # A log of this package must be of this robot, and complete.
     recording = Recording.load(path)
