@@ -78,6 +78,15 @@ def test_a_later_log_that_contradicts_the_mapping_is_named(workplace, recorded, 
     )
 
 
+@pytest.mark.parametrize("columns", [1, 3])
+def test_a_later_log_of_other_joints_is_refused(workplace, recorded, columns):
+    assert cli.main(NEW) == 0
+    t, goal, q = recorded
+    np.savez("other.npz", t_s=t, q_rad=np.tile(q, 2)[:, :columns], goal_rad=np.tile(goal, 2)[:, :columns])
+    with pytest.raises(UsageError, match="expected 2: pan_joint, lift_joint"):
+        open_recording(Path("other.npz"), load_robot("rig"))
+
+
 def test_check_says_of_a_joint_that_stands_still_what_to_record(workplace, capsys, recorded):
     t, goal, q = recorded
     noise = 1e-3 * np.random.default_rng(0).standard_normal(q.shape)

@@ -151,9 +151,18 @@ def open_recording(path: Path, robot: RecordedRobot) -> Recording:
     """
     if (mapping := mapping_of(robot, path)) is not None:
         recording = Recording(path, import_file(path, mapping))
-        _require_fitting(recording, robot)
         sensor: Any = getattr(robot, "sensor", robot)  # a recorded robot has no sensor
-        found = checks.check_episode(recording.episode, [c.label for c in sensor.channels])
+        joints, read = [c.label for c in sensor.channels], recording.episode.outputs.get(SENSOR, {})
+        for field in {c.position for c in sensor.channels if c.index is not None} & set(read):
+            entries, width = {c.index for c in sensor.channels if c.position == field}, read[field].shape[-1]
+            # A robot of one joint may take an entry of a longer vector.
+            if max(entries) >= width or (len(entries) > 1 and len(entries) != width):
+                raise UsageError(
+                    f"{field!r} has {width} columns in {path}, expected {len(entries)}: {', '.join(joints)}",
+                    hint="correct the sources in the mapping, or make a pipeline for these joints with `sim2real new`",
+                )
+        _require_fitting(recording, robot)
+        found = checks.check_episode(recording.episode, joints)
         if wrong := [f.text for f in found if f.weight == "refuse"]:
             more = f"; {len(wrong) - 3} more" if len(wrong) > 3 else ""
             note(f"warning: {path.name} and its mapping contradict each other: {'; '.join(wrong[:3])}{more}")
