@@ -105,16 +105,11 @@ class HingeDrive(RobotDrive):
             angle = rig.wait_until_still(settle_s).position_rad[0]
             if np.cos(angle) < -0.95:
                 return
-            rig.start()
-            try:
+            with rig.running():
                 for _ in range(round(_PUSH_S * self.rate_hz)):
                     rig.measure()  # the limits of speed, jump and envelope need it
                     rig.command(np.array([_PUSH_V]), 0.0, 1e-9 * rig.clock.now_ns())
                     rig.clock.sleep(1 / self.rate_hz)
-            except BaseException:
-                rig.stop_quietly()  # a failure here must not replace the reason
-                raise
-            rig.stop()
         raise SafetyStop(
             f"the pendulum does not hang down after {_PUSHES} pushes of {_PUSH_V} V",
             hint="free it, or check its encoder",

@@ -121,13 +121,8 @@ def measure_delay(witness: Witness, probe: Probe) -> StepAnswers:
         SafetyStop: This machine is too busy to measure, or the gate stopped the robot.
     """
     witness.measured, witness.sent = [], []
-    witness.rig.start()
-    try:
+    with witness.rig.running():
         answers = _answers(witness, probe)
-    except BaseException:
-        witness.rig.stop_quietly()  # a failure here must not replace the reason
-        raise
-    witness.rig.stop()
     return replace(delays_of(answers), lag_s=probe.lag_s)
 
 

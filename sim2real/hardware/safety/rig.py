@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 import threading
 from array import array
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Final, Self
 
@@ -195,6 +196,17 @@ class Rig:
                 self.device.disable()
         finally:
             self._lock.release()
+
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        """Keep the torque on for a block. It is off afterwards, and no failure to stop replaces the block's error."""
+        self.start()
+        try:
+            yield
+        except BaseException:
+            self.stop_quietly()
+            raise
+        self.stop()
 
     def stop_quietly(self) -> None:
         """Switch the torque off while another error is reported; takes no lock, never raises."""

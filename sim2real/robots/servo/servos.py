@@ -227,13 +227,8 @@ def bring_home(rig: Rig, servos: Servos, rate_hz: float, settle_s: float) -> Non
 def _move(rig: Rig, position: np.ndarray, rest: np.ndarray, rate_hz: float) -> None:
     way = rest - position
     steps = int(np.ceil(np.max(np.abs(way)) / HOME_RAD_S * rate_hz))
-    rig.start()
-    try:
+    with rig.running():
         for step in range(1, steps + round(_AT_END_S * rate_hz)):
             rig.measure()
             rig.command(position + min(1.0, step / steps) * way, 0.0, 1e-9 * rig.clock.now_ns())
             rig.clock.sleep(1 / rate_hz)
-    except BaseException:
-        rig.stop_quietly()  # a failure here must not replace the reason
-        raise
-    rig.stop()
