@@ -370,10 +370,10 @@ def why(report: Report, trained: Report) -> str:
     best = min((e for e in arm if e != "ours"), key=lambda e: arm[e])
     ours, wide, sheet = (100 * share[f"{way}/success"] for way in ("posterior", "wide", "data_sheet"))
     return (
-        f"On recordings of an SO-101 arm, motions that no fit saw are predicted to {arm['ours']:.1f} mrad; the best of "
-        f"the others, {NAMES[best]}, is off by {arm[best]:.1f} mrad. Policies trained on the identified model "
-        f"swing simulated pendulums up in {ours:.0f} % of the deployments; after randomisation of wide ranges "
-        f"{wide:.0f} %, and with data-sheet values {sheet:.0f} %.\n"
+        f"Of an SO-101 arm, motions that no fit saw are predicted to {arm['ours']:.1f} mrad; by the best other tool, "
+        f"{NAMES[best]}, to {arm[best]:.1f} mrad. Policies trained on the identified model swing simulated pendulums "
+        f"up in {ours:.0f} % of the deployments; with wide randomisation {wide:.0f} %, with data-sheet values "
+        f"{sheet:.0f} %.\n"
     )
 
 
