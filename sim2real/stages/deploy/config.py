@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated
 
 from sim2real.errors import UsageError
 from sim2real.hardware.safety.gate import GateLimits
@@ -25,8 +25,6 @@ class DeployConfig:
     """Longest wait for the robot to come to rest before an episode [s]."""
     seed: int = 0
     """Seed of the embedded robot."""
-    backend: Literal["numpy", "onnx"] | None = None
-    """Library that runs the policy; default: numpy, but onnxruntime for a custom network."""
     blend_s: float = 0.0
     """Time in which the policy's action grows from zero to full size, for a first try on a robot [s]."""
     measure_delay: bool = True

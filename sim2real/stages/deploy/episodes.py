@@ -43,7 +43,7 @@ def run_episodes(
     Raises:
         Sim2RealError: The cause that stopped the robot.
     """
-    policy: Runner = BlendedRunner(bundle.runner(config.backend), config.blend_s)
+    policy: Runner = BlendedRunner(bundle.runner(), config.blend_s)
     if config.max_tilt_rad is not None and (tilt_rad := tilt_of(robot.task.observation)) is not None:
         policy = UprightRunner(policy, tilt_rad, config.max_tilt_rad)
     folder = logs[0].parent

@@ -109,7 +109,7 @@ def _simulated(
     from sim2real.training.networks.policy import Policy
 
     values = None if identification is None else identification.values
-    played = plain_episodes(robot, bundle.runner(None), values, range(len(recordings)), duration_s)
+    played = plain_episodes(robot, bundle.runner(), values, range(len(recordings)), duration_s)
     if played is not None or identification is None:
         return [(states, states) for states in played or []]
     policy, timing = Policy.from_weights(bundle.weights, bundle.spec), recordings[0].timing
