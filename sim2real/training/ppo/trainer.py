@@ -422,7 +422,8 @@ def make_initial_state(
     """
     first = configs[0]
     seeds = np.arange(first.num_seeds, dtype=np.uint32)
-    key_data = np.stack([jax.random.key_data(jax.random.fold_in(key, seed)) for seed in seeds])
+    folded = [jax.random.fold_in(key, seed) for seed in seeds]
+    key_data = np.stack([jax.random.key_data(each) for each in folded])
 
     # Networks, optimiser and normalisers of each place on the leading axis.
     sizes = env.observation_size, np.shape(env.action_low)[0], privileged_size(env, first)
@@ -435,8 +436,8 @@ def make_initial_state(
     members = len(learners)
     count = members, first.num_envs
     carries = (net.initial_carry() for net in (networks.actor, networks.critic))
-    copies = Copies(*_blank(shapes, count, key), *(_repeated(carry, count) for carry in carries))
-    keys = _keys(np.tile(key_data, (len(configs), 1)), key)
+    copies = Copies(*_blank(shapes, count, folded[0]), *(_repeated(carry, count) for carry in carries))
+    keys = _keys(np.tile(key_data, (len(configs), 1)), folded[0])
     # The share of a curriculum that follows success.
     follows = env.curriculum is not None and env.follow > 0.0
     shares = np.full(members, env.curriculum[0], np.float32) if env.curriculum is not None and follows else None
