@@ -69,7 +69,7 @@ def identify_banner(result: Identification) -> Banner | None:
     first, *others = [sentence(r, [row.joint for row in result.held_out]) for r in result.verdict.reasons] or [""]
     following = f"Next: {result.verdict.next}" if result.verdict.next else ""
     reasons = [first, f"Expected error: {result.outlook()}.", following, *others]
-    return Banner(tone, sentence(result.headline), [reason for reason in reasons if reason])
+    return Banner(tone, f"{result.headline[:1].upper()}{result.headline[1:]}", [reason for reason in reasons if reason])
 
 
 def _tiles(result: Identification) -> Iterator[Tile]:

@@ -12,6 +12,7 @@ from random_models import names
 
 from sim2real import composer
 from sim2real.composer import mjcf
+from sim2real.composer.mjcf.files import Asset, renamed_skin
 from sim2real.errors import UsageError
 
 
@@ -283,3 +284,18 @@ def test_files_are_collected_and_written(tmp_path):
     (tmp_path / "part.xml").unlink()
     with pytest.raises(UsageError, match=r"includes 'part\.xml', which is not there"):
         mjcf.from_path(tmp_path / "arm.xml")
+
+
+def test_the_bones_of_a_skin_file_get_other_names_that_mujoco_reads():
+    def bone(name, vertices):
+        weights = np.array(vertices, np.int32).tobytes() + np.ones(len(vertices), np.float32).tobytes()
+        pose = np.array([0, 0, 0, 1, 0, 0, 0], np.float32).tobytes()
+        return name.encode().ljust(40, b"\0") + pose + np.int32(len(vertices)).tobytes() + weights
+
+    corners = np.array([0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 1], np.float32).tobytes()
+    head = np.array([3, 3, 1, 2], np.int32).tobytes() + corners + np.arange(3, dtype=np.int32).tobytes()
+    skin = renamed_skin(Asset(head + bone("one", [0, 1]) + bone("two", [2]), ".skn"), lambda name: f"robot/{name}")
+    assert skin.contents == head + bone("robot/one", [0, 1]) + bone("robot/two", [2])
+    bodies = "".join(f'<body name="robot/{name}"><geom size=".1"/></body>' for name in ("one", "two"))
+    text = f'<mujoco><asset><skin name="s" file="s.skn"/></asset><worldbody>{bodies}</worldbody></mujoco>'
+    assert mujoco.MjModel.from_xml_string(text, {"s.skn": skin.contents}).nskinbone == 2
