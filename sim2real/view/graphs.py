@@ -85,8 +85,8 @@ def plot_timeline(
                 sent, received = timeline.vertices[edge.sender].end[episode, read], edge.received[episode, read]
                 used = timeline.vertices[reader].start[episode, edge.seq_in[episode, read]]
                 near = (used >= begin_s * TICKS_PER_S) & (sent <= end_s * TICKS_PER_S)
-                times = (times[near] / TICKS_PER_S for times in (sent, received, used))
-                draw_messages(axes, (lanes[edge.sender], lanes[reader]), *times)
+                sent, received, used = (times[near] / TICKS_PER_S for times in (sent, received, used))
+                draw_messages(axes, (lanes[edge.sender], lanes[reader]), sent, received, used)
         axes.set_yticks(list(lanes.values()), list(lanes))
         axes.set_xlim(begin_s, end_s)
         axes.set_ylim(-0.6, len(names) - 0.4)
