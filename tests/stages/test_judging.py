@@ -215,6 +215,9 @@ def test_a_policy_that_does_not_move_is_trained_again_though_its_model_cannot_be
     told = found.verdict
     assert (told.status, told.next) == ("re-train", "sim2real train pendulum --run runs/pendulum/T")
     assert found.reasons == ("success is 0.00, in simulation 1.00", "0.0 s of them in motion")
+    paused = replace(still, episodes=tuple(replace(e, paused_s=0.4) for e in still.episodes))
+    told = verdict.judge(paused, pipeline, IDENTIFIED, folder).verdict
+    assert (told.status, told.stages, told.reasons[0]) == ("not judged", ("deploy",), Reason(Finding.PAUSED))
     moved = replace(deployed(), replay=(), drift=None)
     assert verdict.judge(moved, pipeline, IDENTIFIED, folder).verdict.status == "not judged"
 
