@@ -196,39 +196,25 @@ class ServoDrive(RobotDrive):
             HardwareLost: The robot does not come to rest within ``settle_s`` [s] per attempt.
             SafetyStop: The robot rests at another position, or the gate stopped it.
         """
-        bring_home(rig, self.servos, self.rate_hz, settle_s)
-
-
-def bring_home(rig: Rig, servos: Servos, rate_hz: float, settle_s: float) -> None:
-    """Bring the joints to their rest pose.
-
-    Args:
-        settle_s: Longest time to come to rest, for each try [s].
-
-    Raises:
-        HardwareLost: The robot does not come to rest.
-        SafetyStop: It rests in another pose, or the gate stopped it.
-    """
-    rest = np.asarray(servos.at_rest)
-    position = rig.wait_until_still(settle_s).position_rad
-    if np.max(np.abs(position - rest)) > _AT_HOME_RAD:
-        _move(rig, position, rest, rate_hz)  # a joint without weight stays where it was left
+        rest = self.servos.at_rest
         position = rig.wait_until_still(settle_s).position_rad
-    error = np.abs(position - rest)
-    worst = int(np.argmax(error))
-    if error[worst] > servos.rest_tolerance:
-        raise SafetyStop(
-            f"joint {servos.names[worst]!r} rests at {position[worst]:.2f} rad, "
-            f"not within {servos.rest_tolerance:g} rad of {rest[worst]:g} rad",
-            hint="free it, or check the zero of its encoder",
-        )
+        if np.max(np.abs(position - rest)) > _AT_HOME_RAD:
+            self._move(rig, position, rest)  # a joint without weight stays where it was left
+            position = rig.wait_until_still(settle_s).position_rad
+        error = np.abs(position - rest)
+        worst = int(np.argmax(error))
+        if error[worst] > self.servos.rest_tolerance:
+            raise SafetyStop(
+                f"joint {self.servos.names[worst]!r} rests at {position[worst]:.2f} rad, "
+                f"not within {self.servos.rest_tolerance:g} rad of {rest[worst]:g} rad",
+                hint="free it, or check the zero of its encoder",
+            )
 
-
-def _move(rig: Rig, position: np.ndarray, rest: np.ndarray, rate_hz: float) -> None:
-    way = rest - position
-    steps = int(np.ceil(np.max(np.abs(way)) / HOME_RAD_S * rate_hz))
-    with rig.running():
-        for step in range(1, steps + round(_AT_END_S * rate_hz)):
-            rig.measure()
-            rig.command(position + min(1.0, step / steps) * way, 0.0, 1e-9 * rig.clock.now_ns())
-            rig.clock.sleep(1 / rate_hz)
+    def _move(self, rig: Rig, position: np.ndarray, rest: np.ndarray) -> None:
+        way = rest - position
+        steps = int(np.ceil(np.max(np.abs(way)) / HOME_RAD_S * self.rate_hz))
+        with rig.running():
+            for step in range(1, steps + round(_AT_END_S * self.rate_hz)):
+                rig.measure()
+                rig.command(position + min(1.0, step / steps) * way, 0.0, 1e-9 * rig.clock.now_ns())
+                rig.clock.sleep(1 / self.rate_hz)
