@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from sim2real.robots.walking.body import HiddenTwin, LeggedBody
+from sim2real.emulation.body import HiddenTwin, LeggedBody
 
 LEGS, PARTS = ("FR", "FL", "RR", "RL"), ("hip", "thigh", "calf")
 LYING = (0.0, 1.36, -2.65) * 4

@@ -334,7 +334,7 @@ def train_to_walk(name: str, task: str, way: str, unit: int, options: argparse.N
 
 def _twin(unit: int, day: int) -> Any:
     """Return the hidden parameters of a Go2, 12 to 42 ms late, and of a day: load and floor."""
-    from sim2real.robots.walking.body import HiddenTwin
+    from sim2real.emulation.body import HiddenTwin
 
     rng, today = np.random.default_rng([20261129, unit]), np.random.default_rng([20261129, unit, 1 + day])
     total_s = rng.uniform(0.012, 0.042)

@@ -92,8 +92,9 @@ class Trial:
 
 def one(trial: Trial, seed: int) -> tuple[bool, float, float]:
     """Walk on a hidden twin; return whether it fell, and the errors [m/s], [rad/s]."""
+    from sim2real.emulation.body import HiddenTwin
     from sim2real.policy.bundle import load_bundle
-    from sim2real.robots.walking.twin import STEP_S, HiddenTwin, Twin, walk
+    from sim2real.robots.walking.twin import STEP_S, Twin, walk
     from sim2real.stages.load import load_robot
 
     robot: Any = load_robot(trial.pipeline)

@@ -66,9 +66,10 @@ def run(config: PlayConfig) -> "Walked":
     """
     import numpy as np
 
+    from sim2real.emulation.body import HiddenTwin
     from sim2real.policy.bundle import load_bundle
     from sim2real.robots.walking.robot import ComposedRobot
-    from sim2real.robots.walking.twin import HiddenTwin, Twin, walk
+    from sim2real.robots.walking.twin import Twin, walk
     from sim2real.stages.terminal.console import note, progress, wrote
 
     # Find the policy, and the robot that it is for.

@@ -11,11 +11,11 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sim2real.emulation.plant import STATE_PERIOD_S, Body
+from sim2real.emulation.plant import STATE_PERIOD_S
 from sim2real.emulation.robot import NUMBERS, Emulation, PlannedRobot, VirtualChannel, VirtualTime
 from sim2real.emulation.truth import Kind, TruthLog
 from sim2real.errors import HardwareLost
@@ -32,6 +32,9 @@ from sim2real.hardware.unitree.messages import (
     LowCmd,
     LowState,
 )
+
+if TYPE_CHECKING:
+    from sim2real.emulation.body import LeggedBody
 
 _PERIOD_NS: Final = round(1e9 * PERIOD_S)
 
@@ -54,10 +57,10 @@ class UnitreeEmulation(Emulation):
     tilt_noise_rad: float = 0.002
     accelerometer_noise_m_s2: float = 0.05
 
-    def planned(self, physics: Body, truth: TruthLog, send: Callable[[LowState], object]) -> EmulatedLegs:
+    def planned(self, physics: LeggedBody, truth: TruthLog, send: Callable[[LowState], object]) -> EmulatedLegs:
         return EmulatedLegs(physics, self, truth, send)
 
-    def robot(self, physics: Body, truth_path: Path | None) -> VirtualLegs:
+    def robot(self, physics: LeggedBody, truth_path: Path | None) -> VirtualLegs:
         return VirtualLegs(physics, self, truth_path)
 
 
@@ -73,7 +76,7 @@ class EmulatedLegs(PlannedRobot[UnitreeEmulation]):
 
     def __init__(
         self,
-        body: Body,
+        body: LeggedBody,
         config: UnitreeEmulation,
         truth: TruthLog,
         send: Callable[[LowState], object] | None = None,
@@ -222,7 +225,7 @@ class VirtualLegs(VirtualTime):
         links: The open connections.
     """
 
-    def __init__(self, body: Body, config: UnitreeEmulation, truth_path: Path | None = None) -> None:
+    def __init__(self, body: LeggedBody, config: UnitreeEmulation, truth_path: Path | None = None) -> None:
         self.links: list[VirtualLink] = []
         super().__init__(body, config, truth_path, self._publish)
         self.legs: Any = self.planned

@@ -1,11 +1,9 @@
-"""The physics of emulated robots: protocols of plants and bodies, the clock that steps a plant, and mountings."""
+"""The physics of emulated robots: the protocol of a plant, the clock that steps a plant, and mountings."""
 
 import heapq
 import math
 from collections.abc import Sequence
 from typing import Any, Final, Protocol
-
-import numpy as np
 
 from sim2real.emulation.truth import Kind, TruthLog
 from sim2real.errors import UsageError
@@ -53,50 +51,6 @@ class Plant(Protocol):
 
     def truth(self) -> dict[str, Any]:
         """Return the true parameters, which an identification should find, for the truth log's header."""
-        ...
-
-
-def measured_dtype(motors: int) -> np.dtype:
-    """Return the layout of a body's measurement; every entry is a double.
-
-    Its fields have the names and units of ``LowState``: ``q`` [rad], ``dq`` [rad/s] and ``tau_est`` [N m] of each
-    motor, ``quaternion`` (w first), ``gyroscope`` [rad/s], ``accelerometer`` [m/s^2], and ``foot_force`` [N].
-    """
-    sizes = {"q": motors, "dq": motors, "tau_est": motors, "quaternion": 4, "gyroscope": 3, "accelerometer": 3}
-    return np.dtype([(name, np.float64, (size,)) for name, size in {**sizes, "foot_force": 4}.items()])
-
-
-class Body(Protocol):
-    """A robot on legs, driven by motors with a law each; used by the emulator alone, in one thread.
-
-    Times count from the emulator's start [s].
-
-    Attributes:
-        motors: Number of motors.
-        step_s: Time step of the physics [s].
-    """
-
-    motors: int
-    step_s: float
-
-    def drive(self, law: np.ndarray) -> None:
-        """Set the laws of all motors from the present time on, ``(motors, 5)``: q, dq, kp, kd and tau."""
-        ...
-
-    def step(self) -> None:
-        """Integrate one time step."""
-        ...
-
-    def measure(self) -> np.ndarray:
-        """Return a measurement without noise, of `measured_dtype` and shape ``()``."""
-        ...
-
-    def state(self) -> dict[str, float]:
-        """Return the true state for the truth log, with the same names at every call."""
-        ...
-
-    def truth(self) -> dict[str, object]:
-        """Return the true parameters, which an identification should find."""
         ...
 
 

@@ -51,7 +51,7 @@ class Embedded:
     """An emulated robot, used for the port ``embedded``.
 
     Attributes:
-        plant: Returns its physics: a ``Plant`` or a ``Body`` of ``sim2real.emulation.plant``.
+        plant: Returns its physics: a ``Plant`` of ``sim2real.emulation.plant``, or a ``LeggedBody``.
         emulator: Latencies and faults; its seed is replaced by that of the stage.
         zero_rad: Reading of an encoder, from count 0, at the device's 0 [rad].
     """

@@ -6,10 +6,10 @@ import pytest
 
 from pipelines.go2.robot import ROBOT
 from sim2real import composer
+from sim2real.emulation.body import Terrain
 from sim2real.errors import UsageError
 from sim2real.policy.bundle import load_bundle
 from sim2real.robots.training import training_loop
-from sim2real.robots.walking.body import Terrain
 from sim2real.robots.walking.twin import Twin, walk
 from sim2real.robots.walking.world import ROUGHNESS, Ground
 

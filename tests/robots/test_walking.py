@@ -12,12 +12,13 @@ import pytest
 from pipelines.go2.robot import ROBOT
 from sim2real import cli
 from sim2real.commands.play import PlayConfig, run
+from sim2real.emulation.body import HiddenTwin
 from sim2real.errors import UsageError
 from sim2real.policy.bundle import load_bundle
 from sim2real.policy.contract import observation_size
 from sim2real.robots.walking.drive import gravity_of
 from sim2real.robots.walking.task import Commands
-from sim2real.robots.walking.twin import HiddenTwin, Twin, walk
+from sim2real.robots.walking.twin import Twin, walk
 from sim2real.stages.load import load_robot
 
 ROOT = Path(__file__).parents[2]

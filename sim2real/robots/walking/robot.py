@@ -12,9 +12,9 @@ from typing import ClassVar
 
 import jax
 
+from sim2real.emulation.body import Terrain
 from sim2real.robots.loop import DELAYS
 from sim2real.robots.robot import Robot
-from sim2real.robots.walking.body import Terrain
 from sim2real.robots.walking.drive import LegMotors, WalkingDrive
 from sim2real.robots.walking.stand import LegsInAStand
 from sim2real.robots.walking.task import Commands, Moment, Term, WalkingTask

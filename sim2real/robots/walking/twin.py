@@ -10,13 +10,12 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
+from sim2real.emulation.body import HiddenTwin, LeggedBody
 from sim2real.graph.base import GraphState, StepState
 from sim2real.policy.runner import Runner
 from sim2real.robots.loop import AGENT, DELAYS, SENSOR
 from sim2real.robots.nodes import in_numpy
 from sim2real.robots.robot import Robot
-from sim2real.robots.walking.body import HiddenTwin as HiddenTwin
-from sim2real.robots.walking.body import LeggedBody
 from sim2real.robots.walking.drive import BodyReading, gravity_of, into_base
 from sim2real.robots.walking.robot import ComposedRobot
 from sim2real.robots.walking.world import FRICTION, MOTOR_STRENGTH, PAYLOAD, STRENGTH

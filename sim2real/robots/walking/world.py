@@ -16,13 +16,13 @@ import numpy as np
 from sim2real import composer
 from sim2real.composer import mjcf
 from sim2real.composer.physics.mjx import stepping
+from sim2real.emulation.body import FLOOR, HeightField
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState
 from sim2real.identification.parameters import Parameter
 from sim2real.robots.loop import ACTUATOR, WORLD
 from sim2real.robots.messages import EpisodeStart
 from sim2real.robots.robot import RobotModel
-from sim2real.robots.walking.body import FLOOR, HeightField
 from sim2real.robots.walking.drive import BodyReading
 from sim2real.types import Array, PyTree, Scalar
 from sim2real.worlds.composed import ComposedWorld, WorldParams

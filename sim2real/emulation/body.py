@@ -11,7 +11,6 @@ import mujoco
 import numpy as np
 
 from sim2real.arrays import namespace
-from sim2real.emulation.plant import measured_dtype
 from sim2real.errors import UsageError
 from sim2real.types import Array, Scalar
 
@@ -144,8 +143,18 @@ class HiddenTwin:
         )
 
 
+def measured_dtype(motors: int) -> np.dtype:
+    """Return the layout of a body's measurement; every entry is a double.
+
+    Its fields have the names and units of ``LowState``: ``q`` [rad], ``dq`` [rad/s] and ``tau_est`` [N m] of each
+    motor, ``quaternion`` (w first), ``gyroscope`` [rad/s], ``accelerometer`` [m/s^2], and ``foot_force`` [N].
+    """
+    sizes = {"q": motors, "dq": motors, "tau_est": motors, "quaternion": 4, "gyroscope": 3, "accelerometer": 3}
+    return np.dtype([(name, np.float64, (size,)) for name, size in {**sizes, "foot_force": 4}.items()])
+
+
 class LeggedBody:
-    """A robot of an MJCF file with hidden parameters; see ``sim2real.emulation.plant.Body``.
+    """A robot of an MJCF file with hidden parameters, driven by motors with a law each; times count from its start.
 
     Every geom collides, with elliptic cones. The torque of a motor is its law's, limited to the actuator's range, times
     the motor's strength. The motor reports the torque of its law, as it does not know its strength. Its encoder has a
@@ -159,6 +168,10 @@ class LeggedBody:
         place: ``floor``, or ``stand``: the base is fixed, and the feet are in the air.
         settle_s: Time in which the body comes to rest on the floor, with motors without torque [s].
         ground: Heights in place of the model's floor; None: it is flat.
+
+    Attributes:
+        motors: Number of motors.
+        step_s: Time step of the physics [s].
     """
 
     def __init__(
@@ -224,7 +237,7 @@ class LeggedBody:
         _mj.mj_step(self.model, self.data)
 
     def measure(self) -> np.ndarray:
-        """Return a measurement without noise."""
+        """Return a measurement without noise, of ``measured_dtype`` and shape ``()``."""
         data, measured, n = self.data, self._measured.copy(), self.motors
         measured["q"], measured["dq"] = data.qpos[-n:] + self.hidden.bias_rad, data.qvel[-n:]
         measured["tau_est"] = data.actuator_force / self.hidden.strength
