@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import sys
-from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -198,7 +197,7 @@ def _imported(stage: str) -> Any:
     """Import a stage with JAX, which takes seconds; a terminal shows that they pass."""
     from sim2real.stages.terminal import console
 
-    with console.progress(None, "loading") if sys.stderr.isatty() else nullcontext():
+    with console.progress(None, "loading", sys.stderr.isatty()):
         return importlib.import_module(module_of(stage))
 
 

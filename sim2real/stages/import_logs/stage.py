@@ -3,6 +3,7 @@
 import shlex
 import sys
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from sim2real.robots.model.file import read_model
 from sim2real.robots.model.robot import MjcfRobot
 from sim2real.stages.import_logs.config import ImportConfig
 from sim2real.stages.load import folder_of, load_robot
-from sim2real.stages.terminal.console import note, pairs, wrote
+from sim2real.stages.terminal.console import note, pairs, progress, wrote
 
 
 def run(config: ImportConfig) -> None:
@@ -32,7 +33,8 @@ def run(config: ImportConfig) -> None:
         UsageError: When a file or the mapping cannot be read, they do not fit each other, or the proposed mapping has
             open questions.
     """
-    sets = [open_tables(path, config.episode) for path in config.files]
+    with _busy("read"):
+        sets = [open_tables(path, config.episode) for path in config.files]
     if config.together and len(sets) > 1:
         sets = [[joined([table for tables in sets for table in tables])]]
     if config.out is not None and len(sets[0]) > 1:
@@ -44,20 +46,23 @@ def run(config: ImportConfig) -> None:
         if mapping is None:
             hints = hints_of(config)
             part = tables[0] if config.selection is None else tables[0].cut(config.selection)
-            mapping, text = proposed(part, hints, config.out)
+            with _busy("compare goals and positions"):
+                mapping, text = proposed(part, hints, config.out)
             joints, checked = hints.joints, 1
         else:
             checked = 0
             for line in tables[0].notes:
                 note(line)
-        episodes = [importer.import_table(table, mapping, config.selection) for table in tables]
-        for table, episode in list(zip(tables, episodes, strict=True))[checked:]:
-            refuse_contradictions(table.path, episode, config.as_told, joints)
+        with _busy("compare goals and positions"):
+            episodes = [importer.import_table(table, mapping, config.selection) for table in tables]
+            for table, episode in list(zip(tables, episodes, strict=True))[checked:]:
+                refuse_contradictions(table.path, episode, config.as_told, joints)
 
         # Write the logs, with the proposed mapping beside them.
         written = None
         if config.out is not None:
-            importer.write_log(config.out, episodes[0])
+            with _busy("write"):
+                importer.write_log(config.out, episodes[0])
             print(pairs(importer.facts(episodes[0])))
             wrote(config.out)
             if text:
@@ -69,7 +74,8 @@ def run(config: ImportConfig) -> None:
             with run_folder.open_stage(config.runs, mapping.pipeline, "record", config, inputs) as stage:
                 for i, episode in enumerate(episodes):
                     log = stage.output("log" if not i else f"log_{i}", f"session{f'_{i}' if i else ''}.mcap")
-                    importer.write_log(log, episode)
+                    with _busy("write"):
+                        importer.write_log(log, episode)
                     print(pairs(importer.facts(episode)))
                     wrote(log)
                 if text:
@@ -81,6 +87,11 @@ def run(config: ImportConfig) -> None:
             wrote(written)
             note(f"the next file of this recorder: sim2real import FILE --mapping {shown(written)}")
             text = ""
+
+
+def _busy(what: str) -> AbstractContextManager[Any]:
+    """Show on a terminal that time passes; a log file gets no lines of it."""
+    return progress(None, f"import: {what}", sys.stderr.isatty())
 
 
 def configured_mapping(config: ImportConfig) -> ImportMapping | None:

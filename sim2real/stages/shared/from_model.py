@@ -81,8 +81,9 @@ def describe_robot(flags: RobotFlags, logs: Sequence[str]) -> Described:
         hints = import_logs_stage.hints_of_model(
             flags.mjcf, name, flags.joints, flags.rate_hz, as_told=flags.as_told, unit=flags.unit or ""
         )
-        mapping, _ = import_logs_stage.proposed(open_table(first), hints)
-        episode = import_table(open_table(first), mapping)
+        table = open_table(first)
+        mapping, _ = import_logs_stage.proposed(table, hints)
+        episode = import_table(table, mapping)
     # Describe the robot by the first log.
     description = _description(flags, model, episode)
     note_held(description)
