@@ -88,7 +88,7 @@ def log(call):
 
 def test_it_is_recorded_by_its_device(log):
     recording = Recording.load(log)
-    assert recording.units == {"position": "rad", "velocity": "rad/s", "goal": "rad/s"}
+    assert recording.units == {"position": "rad", "velocity": "rad/s", "command": "rad/s", "goal": "rad/s"}
     assert np.ptp(recording.episode.outputs["actuator"]["goal"]) > 5.0
     assert np.ptp(recording.episode.outputs["sensor"]["velocity"]) > 5.0
     effects = recording.truth.of(Kind.EFFECT)
