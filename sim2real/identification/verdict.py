@@ -219,7 +219,7 @@ def _on_held_out(held_out: Sequence[ComparedError]) -> tuple[bool, list[str]]:
 
 def _beside_baselines(row: ComparedError) -> str:
     """Return the error of a joint, and the baselines that are as good, or the best one."""
-    sentence = str(row)
+    sentence = str(replace(row, expected=None))
     finite = {name: e for name, e in row.baselines.items() if e is not None and name != WITHOUT_DELAYS}
     if row.as_good:
         better = (f"{name} ({with_small_unit(finite[name], row.unit)})" for name in row.as_good)
