@@ -191,7 +191,7 @@ def table(report: Mapping[str, Any]) -> str:
     counts = {r["name"].removeprefix("drift/so101/"): (r["value"], r["unit"]) for r in report["rows"]}
     whats = ["none/false_alarms", *(f"{change}/detected" for change in list(CAUSES)[1:])]
     sound, friction, payload, delay = (
-        f"{round(v * int(unit.split()[1]))} {unit}" for v, unit in map(counts.get, whats)
+        f"{round(v * int(unit.split()[1]))} {unit}" for v, unit in map(counts.__getitem__, whats)
     )
     return (
         f"The verdict is `re-identify` for {sound} unchanged SO-101s, {friction} with friction doubled, {payload} with "
