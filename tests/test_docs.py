@@ -50,12 +50,11 @@ MARKS = {
     "sim2real.identification": [NIGHT],
     "sim2real.runtime": [NIGHT],
 }
-TINY_FIT = '{"generations": 2, "population": 8, "refine_steps": 3, "folds": 0, "free_run_s": 0.0}'
+TINY_FIT = '{"refine_steps": 3, "folds": 0, "free_run_s": 0.0}'
 TINY_PPO = '{"episode_s": 2.0, "timelines": 4, "ppo": {"total_steps": 512, "num_envs": 16, "minibatches": 2}}'
 SMALLER = {
     "README.md": {"(pendulum, model)": f"(pendulum, model, {TINY_PPO})"},
     "docs/guides/interop.md": {"1_000_000": "64", "num_envs=64": "num_envs=2", "num_envs=128": "num_envs=2"},
-    "docs/guides/notebook.md": {'"generations": 10': '"generations": 2'},
     "docs/reference/runs.md": {
         ", recording)": f", recording, {TINY_FIT})",
         ", identification)": f", identification, {TINY_PPO})",

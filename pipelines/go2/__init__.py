@@ -43,7 +43,7 @@ WALK = PPOConfig(
 
 DEFAULTS = Defaults(
     record=RecordConfig(duration_s=12.0, amplitude=0.3, low_hz=0.2, high_hz=4.0, gate=GATE),
-    identify=IdentifyConfig(generations=0, folds=0, after_s=AFTER_S),
+    identify=IdentifyConfig(folds=0, after_s=AFTER_S),
     train=TrainConfig(model="nominal", episode_s=10.0, timelines=256, sensitivity=False, vary=VARY, ppo=WALK),
     deploy=DeployConfig(episodes=5, duration_s=10.0, max_tilt_rad=1.2, gate=GATE),
 )

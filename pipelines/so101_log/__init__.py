@@ -3,12 +3,10 @@
 from sim2real.stages.config import Defaults, IdentifyConfig
 
 DEFAULTS = Defaults(
-    # Forty-five parameters: a search would need thousands of generations, and rough values are available.
     identify=IdentifyConfig(
         initial_state="measured",
         settle_s=0.0,
         horizon_s=8.0,
-        generations=0,
         max_delay_s=0.03,
         free_run_s=130.0,
     ),

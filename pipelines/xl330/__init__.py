@@ -10,7 +10,6 @@ DEFAULTS = Defaults(
         settle_s=0.0,
         horizon_s=0.6,
         spacing_s=0.3,
-        generations=0,
         difference=0.03,
         max_delay_s=0.01,
         reach=1.0,

@@ -22,8 +22,8 @@ class FitConfig:
     """Search algorithm: any name in evosax.algorithms."""
     population: int = 32
     """Candidates a generation."""
-    generations: int = 80
-    """Most generations of a run; 0 skips the search and refines from the nominal values."""
+    generations: int = 0
+    """Most generations of a global search before the refinement from its best candidate and the nominal values."""
     std: float = 0.7
     """Spread of the first generation; 1 covers about half of the bounds' width."""
     refine_steps: int = 25

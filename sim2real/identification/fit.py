@@ -139,13 +139,13 @@ def fit(
     # Refine by least squares, first on windows, then on long segments.
     longer = bool(config.long_s and long_spans)
     if end is None or not longer:
-        # Where all segments take long, the best of several descents on some of them begins the descent on all.
-        few = few_of(problem) if end is None else problem
-        if few is not problem:
-            starts = _refine(few, starts, report).x[None]
-        refined = _refine(problem, starts, report)
         if end is None:
-            refined = _at_other_delays(problem, refined, report)
+            # Where all segments take long, the best of several descents on some of them begins the descent on all.
+            few = few_of(problem)
+            if few is not problem:
+                starts = _refine(few, starts, report, _COARSE).x[None]
+            starts = _at_other_delays(problem, _refine(problem, starts, report, _COARSE), report).x[None]
+        refined = _refine(problem, starts, report)
         if not longer:
             return Fit(problem, refined.x, refined.loss, result, windows, refined.left, refined.converged)
         starts = refined.x[None]
@@ -156,7 +156,7 @@ def fit(
 
 
 def _at_other_delays(problem: Problem, found: Refined, report: OnProgress | None) -> Refined:
-    """Return the minimum that descents from other delays lead to if it is lower; else the one that was found.
+    """Return the point that descents from other delays lead to if its loss is lower; else the one that was found.
 
     They begin a quarter and half a period of the commands below and above it, and again beside each lower minimum.
 
@@ -187,7 +187,7 @@ def _at_other_delays(problem: Problem, found: Refined, report: OnProgress | None
             least = refine(problem, x[None], lively, gain=ROUGH).loss
         if not other.loss < (1.0 - ROUGH) * least:
             break
-        better = _refine(problem, other.x[None], report)
+        better = _refine(problem, other.x[None], report, _COARSE)
         if not better.loss < found.loss:
             break
         found = better
@@ -467,7 +467,7 @@ class _Descent:
             self._on_step(*self._best)
 
 
-def _refine(problem: Problem, starts: np.ndarray, report: OnProgress | None) -> Refined:
+def _refine(problem: Problem, starts: np.ndarray, report: OnProgress | None, gain: float | None = None) -> Refined:
     """Descend from starts to the minimum, with reports."""
     left, share = 1.0, 0.5 / (problem.config.refine_steps * (1 + len(starts)))
 
@@ -478,4 +478,4 @@ def _refine(problem: Problem, starts: np.ndarray, report: OnProgress | None) -> 
         if report:
             report("refine", step, best, x)
 
-    return refine(problem, starts, on_step=advance)
+    return refine(problem, starts, gain=gain, on_step=advance)

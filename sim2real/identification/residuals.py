@@ -345,7 +345,8 @@ class Problem:
     def errors(self, values: Mapping[str, np.ndarray], segments: np.ndarray, shift: np.ndarray) -> np.ndarray:
         """Return ``Rollouts.errors`` without the padding of the programs."""
         found = self.rollouts.errors(values, segments, shift, self.data)[:, : self.ts.shape[1]]
-        return np.where((self.ts[segments] >= 0.0)[..., None], found, 0.0)
+        found[self.ts[segments] < 0.0] = 0.0
+        return found
 
     # -- finite differences by parameters
 
@@ -411,6 +412,8 @@ class Problem:
             for row in error:
                 step = _next_shift(states._replace(residuals=row.copy()), counts) - shift
                 row += np.einsum("sn,snkf->skf", step, states.slope)
+        if len(live) == len(part.live):
+            return error
         whole = np.zeros((copies, len(part.live), *error.shape[2:]))
         whole[:, live] = error
         return whole

@@ -26,9 +26,9 @@ from sim2real.types import Array, MjModel, PyTree, Scalar
 from sim2real.worlds import rollouts as physics
 
 _NEEDED = ("open_loop", "fields", "start", "controls", "message")
-_ON_C, _COMPILED = (4, 24, 48, 128, 512), (32, 256)
+_ON_C, _COMPILED = (4, 24, 48, 128, 512), (32, 256, 1024)
 """Copies in one call of a program. C: a Jacobian of 20 logs took 24 s of processor time with 128 at a time, 18 s with
-512. Compiled: each size is a program that contains the physics."""
+512. Compiled: each size is a program that contains the physics; 1,024 at a time take three quarters of the time."""
 
 
 @dataclass(frozen=True)
@@ -193,7 +193,8 @@ class Rollouts:
             shift: Shape ``(N, 2 * channels)``: distance of the initial state from its estimate from the log, in
                 deviations of ``prior``.
         """
-        found, sizes = [], _ON_C if self._on_c else _COMPILED
+        sizes = _ON_C if self._on_c else _COMPILED
+        found = np.empty((len(segment), data.ts.shape[1], len(self.fields)))
         most = sizes[-1] if len(segment) > 2 * sizes[-1] else sizes[-2]
         for first in range(0, len(segment), most):
             rows = slice(first, first + most)
@@ -208,8 +209,8 @@ class Rollouts:
                 inputs = jax.tree_util.tree_map(lambda a, n=count: np.asarray(a)[:n], before(*copies, data))
                 moved = padded(_single(self._on_c.step(inputs)), len(copies[1]))
                 errors = self._program("errors", self._compared_on_c, (0, 0, 0, 0, None))(*copies, moved, data)
-            found.append(np.asarray(errors, np.float64)[:count])
-        return np.concatenate(found)
+            found[rows] = np.asarray(errors)[:count]
+        return found
 
     def starts(
         self, values: Mapping[str, np.ndarray], segment: np.ndarray, shift: np.ndarray, data: Data

@@ -13,7 +13,6 @@ MODEL_IDENTIFY = IdentifyConfig(
     initial_state="measured",
     settle_s=0.0,
     horizon_s=1.0,
-    generations=0,
     max_delay_s=0.05,
     long_s=None,
 )

@@ -67,7 +67,7 @@ def make_problem(episode):
     model = load_robot("pendulum").identifiable(MAX_DELAY_S)
     begins = np.arange(0.3, DURATION_S - SEGMENT_S - 0.2, SEGMENT_S)
     spans = [Span(0, float(b), i < len(begins) - 3) for i, b in enumerate(begins)]
-    return Problem(model, [episode], spans, SEGMENT_S, FitConfig(max_delay_s=MAX_DELAY_S))
+    return Problem(model, [episode], spans, SEGMENT_S, FitConfig(max_delay_s=MAX_DELAY_S, generations=80))
 
 
 @pytest.fixture(scope="session")

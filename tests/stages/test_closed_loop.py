@@ -39,7 +39,7 @@ def tiny(pipeline):
     train = {"episode_s": 2.0, "timelines": 4, "force": True, "sensitivity": False, "ppo": ppo}
     return {
         "record": replace(pipeline.defaults.record, duration_s=12.0),
-        "identify": replace(pipeline.defaults.identify, generations=10, population=8, folds=0, free_run_s=0.0),
+        "identify": replace(pipeline.defaults.identify, folds=0, free_run_s=0.0),
         "train": replace(pipeline.defaults.train, **train),
         "deploy": replace(pipeline.defaults.deploy, episodes=1, duration_s=4.0),
     }

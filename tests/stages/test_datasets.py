@@ -39,7 +39,7 @@ def test_identification_finds_the_true_parameters(name):
     pipeline = load_robot(entry["pipeline"])
     recording = Recording.load(DATASETS / entry["pipeline"] / name)
     # Estimates are what is looked at; a third of the usual search finds where the descents begin.
-    config = replace(pipeline.defaults.identify, seed=1, folds=0, free_run_s=0.0, generations=25)
+    config = replace(pipeline.defaults.identify, seed=1, folds=0, free_run_s=0.0)
     found = identify(pipeline, recording, config)
     rows = {p.name: p for p in found.parameters}
     for parameter, truth in entry["truth"].items():

@@ -128,8 +128,7 @@ def test_a_refinement_goes_on_from_the_searchs_best_and_counts_from_then_on():
 @pytest.mark.night  # an identification and a half
 def test_a_kill_while_a_fit_is_judged_loses_the_judgement_alone(tmp_path):
     own = [sys.executable, "-m", "sim2real.cli", "identify", "pendulum", "--log", str(LOG), "--runs", str(tmp_path)]
-    quick = ["--generations", "10"]
-    with subprocess.Popen([*own, *quick], stderr=subprocess.PIPE, text=True, cwd=ROOT) as running:
+    with subprocess.Popen(own, stderr=subprocess.PIPE, text=True, cwd=ROOT) as running:
         for line in running.stderr:
             if "identify: held-out parts: started" in line:
                 running.kill()
@@ -139,7 +138,7 @@ def test_a_kill_while_a_fit_is_judged_loses_the_judgement_alone(tmp_path):
     left = Identification.load(path)
     assert left.verdict.status == "not finished"
     assert f"--begin {path}" in left.verdict.next
-    again = [*own, "--begin", str(path), "--generations", "0"]
+    again = [*own, "--begin", str(path)]
     subprocess.run(again, check=True, capture_output=True, cwd=ROOT)
     found = Identification.load(next(tmp_path.rglob("parameters.json")))
     assert found.verdict.status == "change the model"  # as without the kill: the held-out end goes far beyond
