@@ -209,6 +209,15 @@ def test_help_shows_the_flags_that_a_user_sets_and_all_on_request(capsys, all_fl
     assert not {"(default: None)", "╭"} & set(lines)
 
 
+def test_flags_without_a_block_stand_before_all_blocks(capsys):
+    assert cli.main(["train", "pendulum", "--help"]) == 0
+    shown = capsys.readouterr().out
+    names = re.findall(r"^  --([\w.-]+)", shown, re.MULTILINE)
+    assert {"model", "ppo.total-steps"} <= set(names)
+    assert names == sorted(names, key=lambda name: "." in name)
+    assert "\n\n\n" not in shown
+
+
 def test_all_commands_together_show_forty_flags(capsys):
     """A flag of a stage counts once, also where `run` has it with a prefix."""
     shown = set()

@@ -69,12 +69,13 @@ class Episodes:
 
     def rows(self) -> ArtifactTable:
         """Return a row for each parameter: value, interval of the estimate, and interval of the draws."""
-        rows = []
+        rows, some_open = [], any(p.open for p in self.parameters)
         for p in self.parameters:
             low, high = np.quantile(self.draws[p.name], [0.025, 0.975]).tolist()
             drawn, identified = Interval(low, high), Interval(p.low95, p.high95)
-            rows.append([p.name, p.value, identified, drawn, p.unit, "left open by the log" * p.open])
-        return ArtifactTable(("parameter", "value", "95 % identified", "95 % drawn", "unit", ""), rows)
+            rows.append([p.name, p.value, identified, drawn, p.unit, *["left open by the log" * p.open] * some_open])
+        last = ("",) * some_open
+        return ArtifactTable(("parameter", "value", "95 % identified", "95 % drawn", "unit", *last), rows)
 
     def noise_table(self) -> ArtifactTable:
         """Return a row for each reading with noise."""

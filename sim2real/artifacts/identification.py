@@ -483,10 +483,14 @@ class Identification(Shown):
 
     @property
     def held_out(self) -> tuple[ComparedError, ...]:
-        """The errors on all held-out parts up to the longest horizon, the worst joint first."""
+        """The errors on all held-out parts up to the longest horizon, the worst joint first.
+
+        Joints for which a baseline is as good come first, then those with the largest error beside the expected one.
+        """
         rows = [e for e in self.errors if not e.log]
         longest_s = max((e.seconds for e in rows), default=0.0)
-        return tuple(e for e in rows if e.seconds == longest_s)
+        rows = [e for e in rows if e.seconds == longest_s]
+        return tuple(sorted(rows, key=lambda e: (not e.as_good, -(e.ratio or 0.0))))
 
     @property
     def judged(self) -> tuple[ComparedError, ...]:

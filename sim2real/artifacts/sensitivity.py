@@ -86,9 +86,12 @@ class Sensitivity:
         if self.success < _MIN_SUCCESS:
             return f"The success on the identified model is only {self.success:.2f}: train longer first."
         if (at := self.breaks_at(worst)) is None:
+            unbroken = f"No parameter breaks this policy within {largest} half-widths of its 95 % interval"
+            if lowest >= self.success:
+                return f"{unbroken}: success stays {self.success:.2f}, whichever is moved."
             return (
-                f"No parameter breaks this policy within {largest} half-widths of its 95 % interval: success stays "
-                f"above {BROKEN:.0%} of {self.success:.2f}, and is lowest, {lowest:.2f}, with {worst.name!r} moved."
+                f"{unbroken}: success stays above {BROKEN:.0%} of {self.success:.2f}, and is lowest, {lowest:.2f}, "
+                f"with {worst.name!r} moved."
             )
         # Name the smallest move that breaks the policy.
         i = int(np.flatnonzero(self.multiples == at)[0])

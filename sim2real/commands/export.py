@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,6 +56,11 @@ def run(config: ExportConfig) -> Path:
 
     if config.to == "policy":
         return _export_policy(find_bundle(config.source, config.runs), config.out)
+    if (Path(config.source) / "policy.json").is_file():
+        raise UsageError(
+            f"{config.source} is a policy bundle, and {config.to} is a format of estimates",
+            hint=f"sim2real export {shlex.quote(config.source)} --to policy",
+        )
     file = find_parameters(config.source, config.runs)
     identification = Identification.load(file)
     out = config.out or Path(f"{identification.pipeline}_{FILES[config.to]}")

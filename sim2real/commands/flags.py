@@ -242,6 +242,7 @@ def _help(options: Sequence[_Option], prog: str, text: str, examples: Sequence[s
     """Return the help: one block of flags for each nested configuration."""
     values = [o for o in options if o.mark.positional]
     listed = [o for o in options if o not in values and (o.shown or everything)]
+    listed.sort(key=lambda o: "." in o.name)  # a flag of no block would seem to belong to the block above it
     usage = " ".join([prog, *(_placeholder(o) for o in values), "[FLAGS]"])
     lines = [f"usage: {usage}", "", *textwrap.wrap(text, _width()), ""]
     for value in values:

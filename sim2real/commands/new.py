@@ -28,7 +28,7 @@ _COMMANDS = {
 _PIPELINES = Path("pipelines")
 _SILENCE_S = 1.0  # torque is off, so a lost answer is no danger
 _OF_MODEL = {
-    "__init__.py": '''"""Recorded robot of {joints} joints, identified from its model."""
+    "__init__.py": '''"""Recorded robot of {joints}, identified from its model."""
 
 from dataclasses import replace
 
@@ -142,7 +142,8 @@ def _from_model(config: NewConfig) -> None:
     # Refuse a robot that cannot run before a file is written.
     expand(robot.terms, robot.joints, robot.driven(), read_model(robot.model))
     usual = {"horizon_s": MODEL_IDENTIFY.horizon_s, "max_delay_s": MODEL_IDENTIFY.max_delay_s}
-    texts = {name: text.format(joints=len(robot.joints), **usual) for name, text in _OF_MODEL.items()}
+    joints = "one joint" if len(robot.joints) == 1 else f"{len(robot.joints)} joints"
+    texts = {name: text.format(joints=joints, **usual) for name, text in _OF_MODEL.items()}
     texts |= files_of(robot)
     if mapping is not None:
         texts[MAPPING] = to_toml(msgspec.structs.replace(mapping, pipeline=config.name))

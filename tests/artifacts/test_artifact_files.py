@@ -22,7 +22,7 @@ from sim2real.artifacts.bundle import History
 from sim2real.artifacts.deployment import Deployment
 from sim2real.artifacts.episodes import Episodes, Varied
 from sim2real.artifacts.files import plain, read_arrays, read_json, write_arrays, write_json
-from sim2real.artifacts.identification import Estimate, Identification, Judgement, Noise
+from sim2real.artifacts.identification import ComparedError, Estimate, Identification, Judgement, Noise
 from sim2real.artifacts.posterior import Posterior
 from sim2real.artifacts.run import Manifest, Source, StageFolder, write_manifest
 from sim2real.artifacts.sensitivity import Sensitivity
@@ -223,6 +223,23 @@ def test_a_folder_gives_back_what_was_saved(artifact, tmp_path):
     written = artifact.save(tmp_path)
     assert {f.name for f in tmp_path.iterdir()} == set(written.values())
     assert same(artifact, type(artifact).load(tmp_path))
+
+
+@pytest.mark.parametrize(("is_open", "last"), [(True, ("unit", "")), (False, ("95 % drawn", "unit"))])
+def test_a_table_of_episodes_has_a_column_for_open_parameters_where_there_are_some(is_open, last):
+    parameter = replace(DRAWN.parameters[0], open=is_open)
+    table = replace(DRAWN, parameters=(parameter,)).rows()
+    assert table.headers[-2:] == last
+    assert len(table.rows[0]) == len(table.headers)
+
+
+def test_the_worst_joint_has_the_largest_share_of_its_expected_error():
+    elbow, pan = (
+        ComparedError("", name, "rad", 1.0, error, expected=0.004) for name, error in (("elbow", 1e-3), ("pan", 2e-3))
+    )
+    beaten = ComparedError("", "wrist", "rad", 1.0, 1e-3, expected=0.004, as_good=("nominal",))
+    found = replace(IDENTIFIED, errors=(elbow, pan, beaten))
+    assert [row.joint for row in found.held_out] == ["wrist", "pan", "elbow"]
 
 
 def test_the_next_command_names_the_run_in_which_the_file_lies(tmp_path):

@@ -193,8 +193,9 @@ def test_identification_takes_the_log(file, tmp_path, recwarn):
     episode = open_recording(tmp_path / "run.mcap", robot).episode
     assert len(episode.steps["sensor"]) == COUNT
     assert not recwarn.list
-    with pytest.raises(Sim2RealError, match="a log of pipeline 'rig', not of 'arm'"):
+    with pytest.raises(Sim2RealError, match="a log of pipeline 'rig', not of 'arm'") as refused:
         open_recording(tmp_path / "run.mcap", load_robot("arm"))
+    assert "import its file again with --pipeline arm" in refused.value.hint, "there is no pipeline 'rig'"
 
 
 def test_a_log_is_never_overwritten_and_a_failed_one_not_left(file, tmp_path):

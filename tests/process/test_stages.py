@@ -158,4 +158,4 @@ def test_a_robot_is_recorded_and_moved_by_a_policy_without_jax(tmp_path):
     code, said = call("deploy", "pendulum", *flags, *once)
     assert code == errors.OK, said
     (deployed,) = tmp_path.glob("runs/pendulum/*/deploy")
-    assert "success, deployment 0" in manifest_of(deployed)["summary"]
+    assert "success, episode 0" in manifest_of(deployed)["summary"]

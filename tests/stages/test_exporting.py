@@ -127,9 +127,12 @@ def test_an_identification_without_intervals_is_refused(arm, here, capsys, statu
         (["arm"], "no finished 'identify' of pipeline 'arm'"),
         (["arm", "--to", "gazebo"], "gazebo"),
         (["network.onnx", "--to", "policy"], "folder of a policy bundle"),
+        (["bundle"], "hint: sim2real export bundle --to policy"),
     ],
 )
 def test_what_is_not_there_is_said(here, capsys, arguments, words):
+    (here / "bundle").mkdir()
+    (here / "bundle" / "policy.json").write_text("{}")
     (here / "network.onnx").write_bytes(b"x")
     assert cli.main(["export", *arguments]) in (errors.USAGE, errors.ERROR)
     assert words in capsys.readouterr().err

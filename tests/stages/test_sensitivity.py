@@ -114,6 +114,8 @@ def test_the_worst_comes_first_and_the_file_says_the_same(tmp_path):
         "Measure 'first' better: 1 half-width of its 95 % interval below the estimate, at 0.9 u, success falls from "
         "1.00 to 0.50."
     )
+    unmoved = Sensitivity.of(multiples, 1.0, 16, [curve("none", 1, 1, 1, 1)])
+    assert unmoved.advice.endswith("95 % interval: success stays 1.00, whichever is moved.")
     made.save(tmp_path / "sensitivity.json")
     again = Sensitivity.load(tmp_path)
     assert again.advice == made.advice

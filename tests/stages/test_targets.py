@@ -29,6 +29,8 @@ def test_runs_are_found_by_path_name_stage_folder_and_pipeline(tmp_path, monkeyp
         find_run.find_run(root, run_dir, "arm")
     with pytest.raises(UsageError, match=latest.name):
         find_run.find_run(root, "nothing")
+    with pytest.raises(UsageError, match="pipeline 'arm' has no run in runs"):
+        find_run.find_run(root, "arm")
 
 
 def test_a_run_folder_as_working_directory_does_not_stand_for_every_name(tmp_path, monkeypatch):

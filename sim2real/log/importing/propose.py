@@ -214,7 +214,8 @@ class Proposal:
         if other is not None:  # the likeliest first
             choices.sort(key=lambda s: (set(s.labels) != set(other.labels), s.width != other.width))
         if not choices and (longest := max((len(s.values) for s in self.signals), default=0)) < 3:
-            raise UsageError(f"{self.table.path} has {longest} samples", hint="check that the file is complete")
+            count = "1 sample" if longest == 1 else f"{longest} samples"
+            raise UsageError(f"{self.table.path} has {count}", hint="check that the file is complete")
         if not choices:
             raise UsageError(
                 f"{self.table.path} has no {'measured positions' if side == 'measured' else 'commands'}. Columns: "

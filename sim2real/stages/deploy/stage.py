@@ -172,7 +172,7 @@ def _show(deployment: Deployment) -> None:
 def _summary_lines(deployment: Deployment) -> dict[str, Json]:
     """Return the lines that the console prints at the end; the counts are those of the whole session."""
     last = deployment.recordings[-1].summary
-    scores = {f"success, deployment {i}": e.real.get("success") for i, e in enumerate(deployment.episodes)}
+    scores = {f"success, episode {i}": e.real.get("success") for i, e in enumerate(deployment.episodes)}
     counts = {name: last[name.replace(" ", "_")] for name in ("lost replies", "late replies", "command timeouts")}
     measured = {"measured delay": deployment.measured_delay} if deployment.measured_delay else {}
     return {**{name: round(v, 3) for name, v in scores.items() if v is not None}, **measured, **counts}

@@ -164,7 +164,9 @@ def summary(identification: Identification) -> dict[str, str]:
         lines["round trip delay"] = f"{1e3 * total.estimate:.1f} ms"
     for worst in identification.held_out[:1]:
         size = "diverges" if worst.error is None else with_small_unit(worst.error, worst.unit)
-        lines["error on held-out parts"] = f"{worst.joint} {size} {worst.seconds:.3g} s ahead"
+        joints = len(identification.held_out)
+        which = f", the worst of {joints} joints" if joints > 1 else ""
+        lines["error on held-out parts"] = f"{worst.joint} {size} {worst.seconds:.3g} s ahead{which}"
     lines["expected error"] = identification.outlook()
     lines["verdict"] = identification.verdict.status
     return lines

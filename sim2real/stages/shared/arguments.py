@@ -22,7 +22,7 @@ from sim2real.log.schema import unit_of
 from sim2real.robots.identified import LoggedRobot
 from sim2real.robots.loop import ACTUATOR, SENSOR
 from sim2real.robots.robot import RecordedRobot, in_world
-from sim2real.stages.load import defaults_of, mapping_of
+from sim2real.stages.load import available, defaults_of, mapping_of
 from sim2real.stages.terminal.console import note
 
 T = TypeVar("T")
@@ -176,7 +176,10 @@ def open_recording(path: Path, robot: RecordedRobot) -> Recording:
         raise Sim2RealError(f"{path} has no name of its pipeline: its metadata is damaged", hint="record again")
     if owner != robot.name:
         raise Sim2RealError(
-            f"{path} is a log of pipeline {owner!r}, not of {robot.name!r}", hint=f"run `sim2real identify {owner}`"
+            f"{path} is a log of pipeline {owner!r}, not of {robot.name!r}",
+            hint=f"run `sim2real identify {owner}`"
+            if owner in available()
+            else f"if it is of this robot, import its file again with --pipeline {robot.name}",
         )
     require_moved(recording.episode, str(path))
     _require_fitting(recording, robot)

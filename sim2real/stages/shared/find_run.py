@@ -130,7 +130,8 @@ def _nothing_there(root: Path, target: str) -> UsageError:
         )
     if target in pipelines:
         hint = f"make a run with `sim2real run {target}`, or name another folder with --runs DIR"
-    elif close := difflib.get_close_matches(target, [*pipelines, *(n.partition("/")[2] for n in names)], n=1):
+        return UsageError(f"pipeline {target!r} has no run in {root}", hint=hint)
+    if close := difflib.get_close_matches(target, [*pipelines, *(n.partition("/")[2] for n in names)], n=1):
         hint = f"did you mean {close[0]}?"
     elif Path(target).suffix or Path(target).name != target:
         hint = "check the path"
