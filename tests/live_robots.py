@@ -11,7 +11,7 @@ from sim2real.policy.contract import observation_size
 from sim2real.stages.load import load_robot
 
 TINY = [
-    *("--identify.folds=0"),
+    "--identify.folds=0",
     *("--train.episode-s=2", "--train.timelines=4", "--train.force", "--train.no-sensitivity"),
     *("--train.ppo.total-steps=512", "--train.ppo.num-envs=16", "--train.ppo.minibatches=2"),
     *("--train.ppo.evaluations=1", "--deploy.episodes=1", "--deploy.duration-s=2"),
