@@ -1,6 +1,7 @@
 """Pages for a browser: one self-contained HTML file, without scripts and without a network."""
 
 import os
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -115,7 +116,7 @@ def _about_others(run_dir: Path, artifacts: dict[str, StageFolder]) -> list[Note
         if tried and (stage not in artifacts or tried[0].folder != artifacts[stage].folder):
             status = tried[0].manifest.status
             status = "a dry run" if status == "dry run" else status
-            error = tried[0].manifest.error
+            error = re.sub(r"^\w+: ", "", tried[0].manifest.error)  # the exception's name is for the log
             shown = (
                 f"this page shows {artifacts[stage].folder.name}"
                 if stage in artifacts

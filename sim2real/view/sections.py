@@ -274,7 +274,7 @@ def _deploy_banner(deployed: Deployment) -> Banner | None:
     joint = f": {verdict.reasons[0].about}" if verdict.status == "look at this joint" else ""
     title = f"{verdict.status[:1].upper()}{verdict.status[1:]}{joint}"
     reasons = [sentence(reason, [row.joint for row in deployed.replay]) for reason in deployed.reasons]
-    reasons[1:1] = [f"next: {verdict.next}"] if verdict.next else []
+    reasons[1:1] = [f"Next: {verdict.next}"] if verdict.next else []
     return Banner(_DEPLOYED.get(verdict.status, "doubt"), title, reasons)
 
 
@@ -384,11 +384,14 @@ def iterations_sections(run_dir: Path) -> list[PageSection]:
         return []
     block = TableBlock.of("Stages, success and verdict of each iteration", iterations_table(rows))
     best = [r.real for r in rows if r.real is not None]
-    tiles = [Tile("iterations", str(len(rows)), rows[-1].verdict)]
+    tiles = [Tile("iterations", str(len(rows)))]
     if best:
         tiles.append(Tile("success of the last", number(best[-1]), f"of the first {number(best[0])}"))
     lead = "The log of each deployment decides which stages run again."
-    return [PageSection("iterations", "Iterations", lead, tiles, [block])]
+    last = rows[-1]
+    title = f"{last.verdict[:1].upper()}{last.verdict[1:]}"
+    banner = Banner(_DEPLOYED.get(last.verdict, "doubt"), title, [sentence(last.why)] if last.why else [])
+    return [PageSection("iterations", "Iterations", lead, tiles, [block], banner)]
 
 
 SECTIONS = {"record": record_section, "identify": identify_section, "train": train_section, "deploy": deploy_section}

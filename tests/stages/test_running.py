@@ -43,6 +43,7 @@ def test_a_fine_robot_ends_the_loop(world, capsys):
     assert [c.seed for s, c in world.calls if s == "train"] == [0, 1], "the same seed would train the same policy"
     (folder,) = (world.root / "pendulum").iterdir()
     (section,) = iterations_sections(folder)
+    assert (section.box.tone, section.box.title) == ("good", "Fine")
     assert [row[:3] for row in section.blocks[0].rows] == [
         ["1", "record, identify, train, deploy", "0.6000"],
         ["2", "train.2, deploy.2", "1.000"],

@@ -146,17 +146,24 @@ def test_a_record_alone_makes_a_report(tmp_path):
     assert '<section id="train"' not in text
 
 
-def test_the_newest_finished_attempt_is_shown_and_a_newer_failure_is_told(only):
+@pytest.mark.parametrize(
+    ("status", "error", "told"),
+    [
+        ("failed", "Sim2RealError: <i>no</i>", "failed (&lt;i&gt;no&lt;/i&gt;)"),
+        ("interrupted", "KeyboardInterrupt: ", "interrupted"),
+    ],
+)
+def test_the_newest_finished_attempt_is_shown_and_a_newer_failure_is_told(only, status, error, told):
     run = only("identify")
     failed = run / "identify.2"
     failed.mkdir()
     manifest = {
         **{"pipeline": "pendulum", "stage": "identify", "inputs": {}, "outputs": {}},
-        **{"status": "failed", "error": "<i>no</i>", "started": "2026-11-22T08:00:00+00:00"},
+        **{"status": status, "error": error, "started": "2026-11-22T08:00:00+00:00"},
     }
     (failed / "manifest.json").write_text(json.dumps(manifest))
     text = report(run).read_text(encoding="utf-8")
-    assert "The newest attempt at identify is failed (&lt;i&gt;no&lt;/i&gt;): this page shows identify." in text
+    assert f"The newest attempt at identify is {told}: this page shows identify." in text
     assert "21.08" in text
 
 

@@ -67,7 +67,7 @@ def _announce_following(following: Following | None) -> None:
         note("no motor is watched for letting go: how it follows its commands is not known, or following_rad is inf")
         return
     limit = np.max(following.limit)
-    most = f"{limit:.0%} of their push" if following.unit == "1" else f"{limit:.2g} {following.unit}"
+    most = f"{limit:.0%} of its push" if following.unit == "1" else f"{limit:.2g} {following.unit}"
     note(f"a joint that is more than {most} off its commands stops the robot, by {following.source}")
 
 
