@@ -83,7 +83,7 @@ def _export_policy(bundle: Path, out: Path | None) -> Path:
     from sim2real.stages.terminal.console import note, wrote
 
     contract = load_bundle(bundle).contract  # refuses a damaged bundle
-    out = out or Path(f"{bundle.resolve().parent.name}_policy")
+    out = out or Path(f"{contract.robot or bundle.resolve().parent.name}_{FILES['policy']}")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError(f"{out} is there and not empty", hint="name another folder with --out")
     out.mkdir(parents=True, exist_ok=True)

@@ -142,3 +142,8 @@ def test_parameters_of_a_world_that_is_not_installed_are_refused(arm, here, caps
     file = save(replace(arm, internal=Internal(world="nowhere")), here / "found")
     assert cli.main(["export", str(file)]) == errors.USAGE
     assert "nowhere" in capsys.readouterr().err
+
+
+def test_the_folder_of_a_policy_is_called_after_its_pipeline(here, finished_run_dir):
+    assert cli.main(["export", str(finished_run_dir), "--to", "policy"]) == 0
+    assert (here / "pendulum_policy" / "policy.json").is_file()
