@@ -256,7 +256,7 @@ def _help(options: Sequence[_Option], prog: str, text: str, examples: Sequence[s
         about = f"{option.text} [{default}]" if default else option.text
         lines += _entry(f"{option.name} {_placeholder(option)}".rstrip(), about)
     if hidden := len(options) - len(values) - len(listed):
-        lines += ["", f"--help-all lists {hidden} more flags."]
+        lines += ["", f"--help-all lists {hidden} more flag{'s' * (hidden != 1)}."]
     return "\n".join([*lines, "", "examples", *(f"  sim2real {example}" for example in examples), "", EXIT_CODES])
 
 

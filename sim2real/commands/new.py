@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 import shutil
 import sys
 import tempfile
@@ -142,14 +143,16 @@ def _from_model(config: NewConfig) -> None:
     # Refuse a robot that cannot run before a file is written.
     expand(robot.terms, robot.joints, robot.driven(), read_model(robot.model))
     usual = {"horizon_s": MODEL_IDENTIFY.horizon_s, "max_delay_s": MODEL_IDENTIFY.max_delay_s}
-    joints = "one joint" if len(robot.joints) == 1 else f"{len(robot.joints)} joints"
-    texts = {name: text.format(joints=joints, **usual) for name, text in _OF_MODEL.items()}
+    count = "one joint" if len(robot.joints) == 1 else f"{len(robot.joints)} joints"
+    texts = {name: text.format(joints=count, **usual) for name, text in _OF_MODEL.items()}
     texts |= files_of(robot)
     if mapping is not None:
         texts[MAPPING] = to_toml(msgspec.structs.replace(mapping, pipeline=config.name))
+    if config.name in available():
+        note(f"from this folder, {config.name!r} is now the new pipeline, and no longer the one that is installed")
     _write(folder, texts)
     if config.log:
-        log = f"{config.name} --log {config.log}"
+        log = f"{config.name} --log {shlex.quote(str(config.log))}"
         note(f"next: sim2real check {log}; sim2real identify {log}")
 
 
@@ -163,7 +166,7 @@ def _write(folder: Path, texts: dict[str, str]) -> None:
 
 
 def _check_name(name: str, example: str) -> None:
-    if not re.fullmatch(r"[a-z]\w*", name):
+    if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
         raise UsageError(f"new needs a name of small letters, digits and underscores, got {name!r}", hint=example)
 
 

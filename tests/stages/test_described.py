@@ -194,6 +194,7 @@ def test_a_model_with_files_of_its_own_stays_where_it_is(workplace):
         ([*NEW, "--velocity"], "no velocity"),
         (["new", "rig", "--mjcf", "none.xml", "--log", "run.npz"], "none.xml"),
         (["new", "Rig", "--mjcf", "robot.xml"], "small letters"),
+        (["new", "riG", "--mjcf", "robot.xml"], "small letters"),
         (["new", "rig"], "--mjcf"),
         (["validate"], "validate needs RUN|PIPELINE|PARAMETERS"),
     ],
@@ -217,3 +218,10 @@ def test_a_mapping_that_the_data_contradicts_is_refused(workplace, capsys, recor
     assert cli.main(["import", "run.npz", "--mapping", "wrong.toml", "--out", "wrong.mcap", "--as-told"]) == 0
     with pytest.raises(UsageError, match="contradict"):
         describe_robot(RobotFlags(mjcf=Path("robot.xml"), mapping=Path("wrong.toml")), ["run.npz"])
+
+
+@pytest.mark.parametrize(("name", "told"), [("disk", True), ("rig", False)])
+def test_a_pipeline_that_hides_an_installed_one_is_told(workplace, capsys, name, told):
+    assert cli.main(["new", name, "--mjcf", "robot.xml"]) == 0
+    assert ("no longer the one that is installed" in capsys.readouterr().err) == told
+    assert Path(f"pipelines/{name}/__init__.py").read_text().startswith('"""Recorded robot of 2 joints')
