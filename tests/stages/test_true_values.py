@@ -11,9 +11,13 @@ MS = 1_000_000
 AGE_NS = 5 * MS
 
 
-@pytest.mark.parametrize(("servo_ids", "way_ns"), [([], 400_000), ([], 1_500_000), ([1], -300_000)])
+@pytest.mark.parametrize(("servo_ids", "way_ns"), [([], 400_000), ([], 1_500_000), ([], -1_000), ([1], -300_000)])
 def test_the_sample_is_the_one_that_was_read(tmp_path, servo_ids, way_ns):
-    """A published state comes by a way of up to its period of 2 ms; a bus gets its request after the stamp."""
+    """A published state comes by a way of up to its period of 2 ms; a bus gets its request after the stamp.
+
+    In virtual time a state is read in the instant in which it is sent, and the stamp is a tick before it: a Go2's true
+    round trip was 2 ms too long.
+    """
     log = TruthLog(tmp_path / "truth.bin", {"state_names": [], "truth": {}, "servo_ids": servo_ids})
     period = 2 * MS if not servo_ids else 20 * MS
     for k in range(500):

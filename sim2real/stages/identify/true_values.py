@@ -12,6 +12,8 @@ from sim2real.stages.terminal.console import note
 
 _NEAR_NS = 3_000_000
 """Largest distance between a sample of the robot and a step of the sensor that read it [ns]."""
+_SAME_NS = 50_000
+"""How far behind its stamp a step may have read a sample: in virtual time the stamp is a tick before it [ns]."""
 
 
 def true_values(recording: Recording) -> dict[str, float]:
@@ -48,10 +50,10 @@ def sensing_delay_s(truth: Truth, steps: Steps, origin_ns: int) -> float:
     if not len(samples):
         return float("nan")
     # A bus gets a request near its stamp; a robot that publishes its state, which has no servos, sent it before.
-    later = np.clip(np.searchsorted(samples["t_host_ns"], stamp), 0, len(samples) - 1)
-    earlier = np.maximum(later - 1, 0)
-    off_ns = [np.abs(samples["t_host_ns"][at] - stamp) for at in (earlier, later)]
     publishes = not truth.header.get("servo_ids", True)
+    later = np.searchsorted(samples["t_host_ns"], stamp + _SAME_NS * publishes, side="right")
+    earlier, later = np.maximum(later - 1, 0), np.minimum(later, len(samples) - 1)
+    off_ns = [np.abs(samples["t_host_ns"][at] - stamp) for at in (earlier, later)]
     nearest = np.where(publishes | (off_ns[0] < off_ns[1]), earlier, later)
     matched = np.abs(samples["t_host_ns"][nearest] - stamp) < _NEAR_NS
     return _mean_s((stamp - samples["t_ns"][nearest])[matched])
