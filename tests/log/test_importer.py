@@ -184,8 +184,9 @@ def test_commands_are_written_after_the_sample_of_their_stamp(file, tmp_path):
 
 
 def test_identification_takes_the_log(file, tmp_path, recwarn):
+    from sim2real.artifacts.recording import Recording
     from sim2real.stages.load import load_robot
-    from sim2real.stages.shared.arguments import open_recording
+    from sim2real.stages.shared.arguments import open_recording, recordings_of
 
     robot = copy.copy(load_robot("disk"))
     robot.name, robot.units = "rig", {}
@@ -196,6 +197,8 @@ def test_identification_takes_the_log(file, tmp_path, recwarn):
     with pytest.raises(Sim2RealError, match="a log of pipeline 'rig', not of 'arm'") as refused:
         open_recording(tmp_path / "run.mcap", load_robot("arm"))
     assert "import its file again with --pipeline arm" in refused.value.hint, "there is no pipeline 'rig'"
+    with pytest.raises(Sim2RealError, match="a log of pipeline 'rig', not of 'arm'"):
+        recordings_of(Recording.load(tmp_path / "run.mcap"), load_robot("arm"))
 
 
 def test_a_log_is_never_overwritten_and_a_failed_one_not_left(file, tmp_path):

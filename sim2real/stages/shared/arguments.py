@@ -54,6 +54,8 @@ def recordings_of(value: Any, robot: RecordedRobot, name: str = "recording") -> 
         if isinstance(one, str | PathLike):
             recordings.append(open_recording(Path(one), robot))
         elif isinstance(one, Recording):
+            if "log" in one.episode.metadata:  # it was read from a log of this package
+                _require_owner(one, robot)
             recordings.append(one)
         else:
             hint = "sim2real.Recording.load(PATH) opens one"
@@ -171,7 +173,18 @@ def open_recording(path: Path, robot: RecordedRobot) -> Recording:
     recording = Recording.load(path)
     for warning in recording.warnings:
         note(f"warning: {warning}; the readable part is used")
-    owner = recording.pipeline
+    _require_owner(recording, robot)
+    require_moved(recording.episode, str(path))
+    _require_fitting(recording, robot)
+    holes = {n: m for n, m in (recording.episode.metadata["log"].get("missing_steps") or {}).items() if m}
+    if holes:
+        raise Sim2RealError(f"{path} lacks steps of {', '.join(holes)}: a part of it is damaged", hint="record again")
+    return recording
+
+
+def _require_owner(recording: Recording, robot: RecordedRobot) -> None:
+    """Refuse a log of another pipeline."""
+    path, owner = recording.path, recording.pipeline
     if owner is None:
         raise Sim2RealError(f"{path} has no name of its pipeline: its metadata is damaged", hint="record again")
     if owner != robot.name:
@@ -181,12 +194,6 @@ def open_recording(path: Path, robot: RecordedRobot) -> Recording:
             if owner in available()
             else f"if it is of this robot, import its file again with --pipeline {robot.name}",
         )
-    require_moved(recording.episode, str(path))
-    _require_fitting(recording, robot)
-    holes = {n: m for n, m in (recording.episode.metadata["log"].get("missing_steps") or {}).items() if m}
-    if holes:
-        raise Sim2RealError(f"{path} lacks steps of {', '.join(holes)}: a part of it is damaged", hint="record again")
-    return recording
 
 
 def _require_fitting(recording: Recording, robot: RecordedRobot) -> None:
