@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from sim2real.artifacts.identification import (
@@ -14,6 +15,7 @@ from sim2real.artifacts.identification import (
     Internal,
     Judgement,
 )
+from sim2real.artifacts.posterior import Posterior
 from sim2real.artifacts.recording import Recording
 from sim2real.errors import UsageError
 from sim2real.stages.load import load_robot
@@ -113,3 +115,19 @@ def test_each_log_is_scored_alone_and_a_bad_one_does_not_stop_the_others():
     assert alone.error == pytest.approx(ahead[good.path.name].error, rel=0.02)  # programs of other sizes
     with pytest.raises(UsageError, match="lacking"):
         stage.score(found, pipeline, [lacking])
+
+
+@pytest.mark.parametrize(("deviation", "unsteady"), [(0.5, {"chirp.mcap": ["hinge"]}), (1e-6, {})])
+def test_a_free_run_that_parameters_within_their_uncertainty_carry_away_is_no_test(deviation, unsteady):
+    """A good model of a pendulum was 135 times worse than expected in a free run of its swing-up."""
+    pipeline, found = identification()
+    gain = next(p for p in found.parameters if p.name == "gain")
+    low, middle, high = (np.log([value]) for value in (gain.lower, gain.estimate, gain.upper))
+    found = replace(
+        found,
+        expected_error=(*found.expected_error, ExpectedError("hinge", "rad", 2.0, 0.05, free_run=True)),
+        posterior=Posterior(("gain",), ("log",), middle, np.array([[deviation**2]]), low, high),
+    )
+    scored = stage.score(found, pipeline, [open_recording(LOGS[0], pipeline)])
+    assert scored.unsteady == unsteady
+    assert any(e.free_run for e in scored.errors) == (not unsteady)

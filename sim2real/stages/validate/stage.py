@@ -43,6 +43,8 @@ _FREE_RUN_S = 10.0
 """Longest free run of an identification without an expected error of free runs [s]."""
 _LEAST_S = 0.2
 """Shortest prediction [s]."""
+_NEIGHBOURS = 4
+"""Models within the uncertainty whose free runs show whether one is a test."""
 _SHOWN = 12
 """Rows that the console prints, those with the largest ratio; ``--json`` has all."""
 
@@ -55,6 +57,8 @@ class Validation(Shown):
         errors: For each log and each joint that moves there, ahead and in a free run; the largest ratio first.
         identified: The status of the identification.
         resting: Log -> joints that do not move in it.
+        unsteady: Log -> joints whose free run is not judged: parameters within their uncertainty move it by more than
+            the expected error, as those of a pendulum do that balances.
         refused: Log -> why it was not scored.
     """
 
@@ -63,6 +67,7 @@ class Validation(Shown):
     errors: tuple[ComparedError, ...]
     identified: str = ACCEPTED
     resting: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    unsteady: Mapping[str, Sequence[str]] = field(default_factory=dict)
     refused: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -140,6 +145,8 @@ def run(config: ValidateConfig) -> bool:
     print(artifact_table(found.rows(), _SHOWN))
     for log, joints in found.resting.items():
         note(f"{', '.join(joints)} does not move in {log}, which tests nothing about it")
+    for log, joints in found.unsteady.items():
+        note(f"no test of {', '.join(joints)}: free runs of {log} end far apart within the parameters' uncertainty")
     for log, reason in found.refused.items():
         note(f"not scored: {log}: {reason}")
     if found.identified != ACCEPTED:
@@ -225,11 +232,11 @@ def score(
     # Predict windows of the horizon, and a free run of each log; a short log has shorter ones.
     horizon_s = next((row.seconds for row in identification.held_out), fitting.horizon_s)
     run_s = max((e.seconds for e in identification.expected_error if e.free_run), default=_FREE_RUN_S)
-    errors, measured = list[ComparedError](), positions(model, robot.units)
+    errors, unsteady, measured = list[ComparedError](), dict[str, list[str]](), positions(model, robot.units)
     with progress(None, "validate: simulate"):
         windows = None
         for free_run, most_s in ((False, horizon_s), (True, run_s)):
-            values = {"identified": models["identified"]} if free_run else models
+            values = _neighbours(identification, models["identified"]) if free_run else models
             seconds = [min(most_s, length) for length in lengths]
             windows = _windows(model, good, seconds, fitting, free_run, windows)
             columns = prediction.samples(windows, values, fitting.settle_s)
@@ -241,10 +248,14 @@ def score(
                 moves = dict(zip(prediction.labels(windows), moves, strict=True))
                 moves = {p.name: moves[p.column] for p in measured}
                 of_log = {name: column[columns["recording"] == r] for name, column in columns.items()}
-                rows = prediction.errors(of_log, list(values), measured, fitting.settle_s, seconds[r])
+                judged = ["identified"] if free_run else list(values)
+                rows = prediction.errors(of_log, judged, measured, fitting.settle_s, seconds[r])
                 for row in (row for row in rows if moves[row.joint]):
                     limit = identification.expected_of(row.joint, free_run)
                     expected = None if limit is None else wider.get(row.joint, 1.0) * limit.error
+                    if free_run and expected is not None and not _spread(of_log, row.field, values) <= expected:
+                        unsteady.setdefault(log.path.name, []).append(row.joint)
+                        continue
                     found = replace(row, log=log.path.name, free_run=free_run, seconds=seconds[r], expected=expected)
                     errors.append(replace(found, as_good=(), baselines={}) if free_run else found)
     # A joint that rests is not compared: "no motion" would always be best.
@@ -255,7 +266,25 @@ def score(
     ordered = tuple(sorted(errors, key=lambda e: -(e.ratio or 0.0)))
     resting = {log: joints for log, joints in resting.items() if joints}
     status = identification.verdict.status
-    return Validation(robot.name, horizon_s, ordered, status, resting, refused)
+    return Validation(robot.name, horizon_s, ordered, status, resting, unsteady, refused)
+
+
+def _neighbours(identification: Identification, values: Mapping[str, float]) -> dict[str, dict[str, float]]:
+    """Return the identified model, and models drawn within its uncertainty."""
+    models = {"identified": dict(values)}
+    if (posterior := identification.posterior) is not None:
+        drawn = posterior.sample(np.random.default_rng(0), _NEIGHBOURS)
+        own = {n: rows for n, rows in drawn.items() if n in values}
+        models |= {
+            f"neighbour {k}": {**values, **{n: float(rows[k]) for n, rows in own.items()}} for k in range(_NEIGHBOURS)
+        }
+    return models
+
+
+def _spread(columns: Mapping[str, np.ndarray], position: str, models: Mapping[str, object]) -> float:
+    """Return how far neighbours of the identified model move a joint, the largest root mean square; 0 without any."""
+    identified, *others = (columns[f"{position}_{name}"] for name in models)
+    return max((float(np.sqrt(np.mean((other - identified) ** 2))) for other in others), default=0.0)
 
 
 def models_of(identification: Identification, model: IdentifiableModel) -> dict[str, dict[str, float]]:
