@@ -373,7 +373,7 @@ def links(problem: Problem, x: np.ndarray) -> tuple[Link, ...]:
         UsageError: When no delay of the measurements is identified.
     """
     late, table = measured(problem.table), problem.table
-    # Give both sides of the world half of the delay, so that those of single measurements can be shorter or longer.
+    # Split the delay evenly between commands and measurements: that of a single measurement may be below the mean, too.
     values = {n: np.asarray(v, np.float64) for n, v in table.decode(x).items()}
     commands = [c.name for c in table.columns if c.side == "command"]
     half_s = (float(values[late]) + sum(float(values[n]) for n in commands)) / 2.0

@@ -103,7 +103,7 @@ def configured_mapping(config: ImportConfig) -> ImportMapping | None:
 
 
 def hints_of(config: ImportConfig) -> ImportHints:
-    """Return the user's description of files without a mapping."""
+    """Return what the flags say of files for which there is no mapping: robot, joints, rate, unit."""
     more = {"as_told": config.as_told, "unit": config.unit or "", "calibration": config.calibration}
     if config.mjcf is not None:
         name = config.pipeline or pipeline_name(config.mjcf)

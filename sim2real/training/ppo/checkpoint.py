@@ -1,4 +1,4 @@
-"""A training after an evaluation, and its safetensors file, to continue from.
+"""The state of a training right after an evaluation, and its safetensors file, to continue from.
 
 The file is replaced as a whole: a process that is interrupted while it writes leaves the earlier file. Orbax takes
 0.5 s to import, and 45 ms for a save that takes 6 ms here.
@@ -53,7 +53,7 @@ class Progress:
 
 
 class Checkpoint(NamedTuple):
-    """A training after an evaluation.
+    """The state of a training right after an evaluation.
 
     Attributes:
         policies: The policies of all seeds; None before the first evaluation.
