@@ -43,6 +43,20 @@ def test_velocity_is_for_free_entities(placed, caplog):
     np.testing.assert_array_equal(angular, [0, 0, 2])
 
 
+def test_a_pose_is_set_in_parts_and_moved(placed):
+    physics, ball, _, _ = placed
+    ball.set_pose(physics, position=[1, 2, 3])
+    ball.set_pose(physics, quaternion=2 * ABOUT_Z)
+    ball.shift_pose(physics, position=[0, 0, 1])
+    position, quaternion = ball.get_pose(physics)
+    np.testing.assert_allclose(position, [1, 2, 4])
+    np.testing.assert_allclose(quaternion, ABOUT_Z)
+    ball.shift_pose(physics, quaternion=ABOUT_Z)
+    position, quaternion = ball.get_pose(physics)
+    np.testing.assert_allclose(position, [1, 2, 4])
+    np.testing.assert_allclose(quaternion, [0, 0, 0, 1], atol=1e-12)
+
+
 def test_an_entity_that_is_not_attached_has_no_pose():
     ball = Ball()
     physics = mjcf.Physics.from_mjcf_model(ball.mjcf_model)

@@ -112,3 +112,24 @@ def test_the_first_argument_of_an_observable_may_have_any_name():
     step = composer.Environment(composer.NullTask(rod)).reset()
     assert {k: float(np.ravel(v)[0]) for k, v in step.observation.items()} == {"angle": 0.0, "height": 1.0}
     assert composer.observable(lambda physics: physics.time()).takes_physics
+
+
+def test_observables_are_enabled_and_configured_by_name_or_all_at_once():
+    text = (
+        '<mujoco><worldbody><body name="b" pos="0 0 .5"><joint name="j"/><geom size=".1"/></body></worldbody></mujoco>'
+    )
+    rod = Rod(mjcf.from_xml_string(text))
+    observables = rod.observables
+    observables.add_observable("time", lambda physics: physics.time(), enabled=False)
+    enabled = lambda: {n: o.enabled for n, o in observables.as_dict(fully_qualified=False).items()}  # noqa: E731
+    assert not enabled()["time"]
+    observables.enable_all()
+    observables.set_options({"height": {"enabled": False, "buffer_size": 3}})
+    assert enabled() == {"angle": True, "height": False, "time": True}
+    assert observables.get_observable("height").buffer_size == 3
+    observables.set_options({"update_interval": 5})
+    assert {o.update_interval for o in observables.as_dict().values()} == {5}
+    observables.disable_all()
+    assert not any(enabled().values())
+    with pytest.raises(KeyError, match="Available: angle, height, time"):
+        observables.set_options({"width": {"enabled": True}})
