@@ -144,7 +144,8 @@ def fit(
             few = few_of(problem)
             if few is not problem:
                 starts = _refine(few, starts, report, _COARSE).x[None]
-            starts = _at_other_delays(problem, _refine(problem, starts, report, _COARSE), report).x[None]
+            found = _refine(problem, starts, report, _COARSE)
+            starts = _at_other_delays(problem, found, report, takes_long=few is not problem).x[None]
         refined = _refine(problem, starts, report)
         if not longer:
             return Fit(problem, refined.x, refined.loss, result, windows, refined.left, refined.converged)
@@ -155,7 +156,7 @@ def fit(
     return Fit(problem, refined.x, refined.loss, result, windows, refined.left, refined.converged)
 
 
-def _at_other_delays(problem: Problem, found: Refined, report: OnProgress | None) -> Refined:
+def _at_other_delays(problem: Problem, found: Refined, report: OnProgress | None, takes_long: bool) -> Refined:
     """Return the point that descents from other delays lead to if its loss is lower; else the one that was found.
 
     They begin a quarter and half a period of the commands below and above it, and again beside each lower minimum.
@@ -183,7 +184,7 @@ def _at_other_delays(problem: Problem, found: Refined, report: OnProgress | None
         other, least = refine(problem, np.stack(starts), lively, gain=ROUGH), problem.loss(x, lively)
         # Fewer segments have a lower minimum at any delay. From there a descent on all may end in another valley;
         # that of EMPS has held-out errors lower by a fifth. Where it takes long, it is made for a better delay only.
-        if few_of(problem) is not problem:
+        if takes_long:
             least = refine(problem, x[None], lively, gain=ROUGH).loss
         if not other.loss < (1.0 - ROUGH) * least:
             break

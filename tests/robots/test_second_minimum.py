@@ -34,6 +34,6 @@ def test_a_fit_that_ends_in_the_second_minimum_goes_on_to_the_first():
     problem = Problem(model, [episode], spans, 1.3, config, table)
     x = table.encode(values | SECOND)
     second = Refined(x, problem.loss(x), np.nan, False)
-    found = table.decode(_at_other_delays(problem, second, None).x)
+    found = table.decode(_at_other_delays(problem, second, None, takes_long=False).x)
     assert found["actuator_delay"] == pytest.approx(TRUTH["actuator_delay"], abs=1.5e-3)
     assert found["armature"] == pytest.approx(TRUTH["armature"], rel=0.1)

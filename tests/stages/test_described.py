@@ -1,5 +1,6 @@
 """``sim2real new``: a model and a log describe a robot, and become a pipeline."""
 
+import copy
 from pathlib import Path
 
 import numpy as np
@@ -62,6 +63,21 @@ def test_a_later_log_is_read_by_the_mapping_of_the_pipeline(workplace, recorded)
     pipeline = load_robot("rig")
     log = open_recording(Path("still.npz"), pipeline)
     assert log.episode.outputs["sensor"]["position"].shape == q.shape
+
+
+def test_a_robot_with_motors_reads_a_log_of_another_recorder_by_its_mapping(workplace, recorded):
+    robot, (t, goal, q) = copy.copy(load_robot("arm")), recorded
+    robot.folder = workplace
+    signals = "\n".join(
+        f'[nodes.{node}]\nstamps = "t_s"\nfields.{field} = {{ source = "{source}", unit = "rad" }}'
+        for node, field, source in (("actuator", "goal", "goal_rad"), ("sensor", "position", "q_rad"))
+    )
+    Path("import.toml").write_text(f'pipeline = "arm"\n{signals}\n')
+    three = lambda x: np.concatenate([x, np.sin(2.0 * x[:, :1])], axis=1)  # noqa: E731
+    np.savez("three.npz", t_s=t, q_rad=three(q), goal_rad=three(goal))
+    assert open_recording(Path("three.npz"), robot).episode.outputs["sensor"]["position"].shape == (1000, 3)
+    with pytest.raises(UsageError, match="2 columns"):
+        open_recording(Path("run.npz"), robot)
 
 
 def test_a_later_log_that_contradicts_the_mapping_is_named(workplace, recorded, capsys):

@@ -222,11 +222,6 @@ class ParameterAt:
         """Whether it is a limit that no pattern names: the file's own limits hold, too."""
         return self.what in LIMITS and bool(self.parameter.term) and not self.parameter.free
 
-    @property
-    def of_robot(self) -> bool:
-        """Whether it is one of the whole robot."""
-        return QUANTITIES[self.what].place == "robot"
-
 
 # -- patterns
 

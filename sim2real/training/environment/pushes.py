@@ -44,12 +44,13 @@ class Pushes:
             )
         if vary.push_hz > rate_hz:
             raise UsageError(f"vary.push_hz must not exceed the policy's rate, {rate_hz:g} Hz, got {vary.push_hz:g}")
-        floats, angular = getattr(world, "floats", False), vary.push_angular
-        if angular is not None and not floats:
+        floating_base, angular = getattr(world, "floats", False), vary.push_angular
+        if angular is not None and not floating_base:
             raise UsageError(
                 f"vary.push_angular: a {type(world).__name__} has no floating base", hint="--vary.push pushes joints"
             )
-        sizes = (vary.push,) * 3 + (vary.push if angular is None else angular,) * 3 if floats else (vary.push,)
+        every = vary.push if angular is None else angular
+        sizes = (vary.push,) * 3 + (every,) * 3 if floating_base else (vary.push,)
         return Pushes(world.name, world, sizes, vary.push_hz / rate_hz)
 
     def kicks(self, key: jax.Array, shape: tuple[int, ...], width: jax.Array | None = None) -> jax.Array:

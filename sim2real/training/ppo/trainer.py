@@ -78,9 +78,9 @@ class TrainResult:
             come first.
         history: Name -> shape ``(evaluations, num_seeds)``: the values of ``Progress``; shorter than
             ``config.evaluations`` if training ended earlier: at the target, or after ``config.minutes``.
-        env_steps: Shape ``(evaluations,)``: number of rows per seed at each evaluation.
+        env_steps: Shape ``(evaluations,)``: number of rows per seed at each evaluation, of one policy step at most.
         elapsed_s: Shape ``(evaluations,)``: time that training took so far [s].
-        observations: Shape ``(N, O)``: the copies' last observations, of the best policy's place on the seed axis.
+        observations: Shape ``(N, O)``: the last observations of the best policy's simulations.
         env_steps_per_s: Rows of all seeds per second of ``train_s``, without those of evaluations.
         compile_s: Time to trace and compile [s].
         train_s: Time to train and evaluate [s]; of a resumed training, since it was resumed.
