@@ -47,6 +47,20 @@ def test_actions_stay_within_the_bounds_and_reach_them(policy):
     np.testing.assert_allclose(actions.max(0), policy.high)
 
 
+def test_noise_comes_only_from_a_key(policy):
+    observation = jnp.array([1.0, 0.0, -2.0])
+    act = jax.jit(lambda policy, key: policy.get_action(observation, key))
+    keys = jax.random.split(jax.random.key(0), 4000)
+    noisy = np.asarray(jax.vmap(act, (None, 0))(policy, keys))
+    still = np.asarray(policy.get_action(observation))
+    np.testing.assert_array_equal(still, act(policy, None))
+    inside = (noisy[:, 0] > -1.99) & (noisy[:, 0] < 1.99)
+    # Half the range of the first action is 2, so its noise is 2 exp(-1), slightly less as the bounds cut its tails.
+    assert inside.mean() > 0.95
+    assert noisy[:, 0].std() == pytest.approx(2.0 * np.exp(-1.0), rel=0.1)
+    assert noisy[:, 0].mean() == pytest.approx(still[0], abs=0.05)
+
+
 def test_weights_make_the_same_policy(policy):
     again = Policy.from_weights(policy.to_weights())
     assert jax.tree.structure(again) == jax.tree.structure(policy)

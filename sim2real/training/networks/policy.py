@@ -101,8 +101,11 @@ class Policy(Base):
         carry, u = self.get_mean(carry, observation)
         return carry, self.to_action(u)
 
-    def get_action(self, observation: jax.Array) -> jax.Array:
+    def get_action(self, observation: jax.Array, rng: jax.Array | None = None) -> jax.Array:
         """Return the action, shape ``(A,)``, for an observation, shape ``(O,)``.
+
+        Args:
+            rng: JAX key of the exploration noise; None: no noise. A node of a graph may sample its action with it.
 
         Raises:
             UsageError: The policy has memory: its action depends on earlier observations.
@@ -112,7 +115,10 @@ class Policy(Base):
                 f"a policy of network {self.spec.name!r} remembers: its action does not follow from an observation",
                 hint="call step(carry, observation), beginning each episode with initial_carry()",
             )
-        return self.step(self.initial_carry(), observation)[1]
+        _, u = self.get_mean(self.initial_carry(), observation)
+        if rng is not None:
+            u = u + jnp.exp(self.log_std) * jax.random.normal(rng, u.shape, u.dtype)
+        return self.to_action(u)
 
     def to_weights(self) -> dict[str, np.ndarray]:
         """Return the arrays of a policy bundle: ``layers.<i>.kernel``, ``layers.<i>.bias``, ``log_std``, ...
