@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     Number: TypeAlias = Array | np.number | np.bool_ | float
     """A scalar of JAX, numpy or Python."""
     Value: TypeAlias = jax.Array | float
-    """A quantity in a compiled program: a number, or one for each joint."""
+    """A quantity in a compiled program: one number, or an array with a number for each joint."""
 else:
     Array = Number = Value = PyTree
 
@@ -36,7 +36,7 @@ class Base:
 
     def replace(self, **changes: PyTree) -> Self:
         """Return a copy with other values in some fields."""
-        # flax adds this method to each of its dataclasses, where no type checker finds it.
+        # flax adds this method at run time; type checkers find it here.
         instance: PyTree = self
         return dataclasses.replace(instance, **changes)
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 _CONSTANT_S = 1e-7
 """Recorded delays with a smaller standard deviation are a constant [s]."""
 _MAX_LAG = 200
-"""Largest lag at which their autocorrelation is computed [delays]."""
+"""Largest lag at which the autocorrelation of recorded delays is computed [delays]."""
 
 
 class DelayDistribution(ABC):
@@ -214,7 +214,7 @@ class TrainableDist(Base, DelayDistribution):
         return np.full(shape, self.min)
 
     def quantile(self, q: float) -> float:
-        """Return the delay [s] for every ``q``: a new connection takes it as its expected delay."""
+        """Return the delay [s], for every ``q``: a new connection expects it."""
         del q
         return float(self.delay)
 
@@ -230,9 +230,9 @@ class TrainableDist(Base, DelayDistribution):
         - ``zoh``: the last ``window`` messages that have arrived.
         - ``linear``: linear interpolation between messages over their arrival times. The newest entry is the value at
           the step's start, between the last message that has arrived and the next one, which has not. The entries
-          before it are values at earlier times: as much earlier as their messages arrived before the newest one. An
-          empty slot has the default output, which counts as having arrived at time 0.
-        - ``zoh_mean``: the mean over the reader's period of the message that holds.
+          before it are values at earlier times, with the distances at which their messages arrived. An empty slot has
+          the default output, as if it had arrived at time 0.
+        - ``zoh_mean``: the mean of the command over the reader's period; a message holds until the next one arrives.
 
         Floats are interpolated and averaged. Other values, and ``seq``, are those of the message that has arrived at
         that time: an integer may be a flag, a counter, or an encoder's ticks, which start again at 0 after a turn.
@@ -274,7 +274,7 @@ def _interpolate(inputs: InputState, knots: Array, query: Array, slack: float) -
     held = jnp.maximum(jnp.sum(knots[None] < query[:, None] + slack, axis=1) - 1, 0)
     above = jnp.clip(held + 1, 1, knots.shape[0] - 1)
     low, high = knots[above - 1], knots[above]
-    # In a burst two messages may arrive at the same time: the value jumps, and that of the later one holds.
+    # In a burst two messages may arrive at the same time: the value of the later one holds.
     span = jnp.where(high > low, high - low, 1.0)
     weight = jnp.where(held >= above, 1.0, jnp.clip((query - low) / span, 0.0, 1.0))
 
@@ -295,7 +295,7 @@ def _mean_over_period(inputs: InputState, late: Array, window: int, period_s: fl
     ``seq`` and times are not averaged: they are those of the message that holds when the period begins. The oldest
     message in the window counts as holding from the start of the period.
     """
-    # Fraction of the period in which each message, or a newer one, holds.
+    # Fraction of the period in which this message or a newer one holds.
     share = jnp.clip(1.0 + late / period_s, 0.0, 1.0)
     held = _part(inputs, jnp.maximum(jnp.sum(late > -HALF_TICK_S) - window, 0), window)
 
@@ -322,7 +322,7 @@ def _part(inputs: InputState, first: Array, window: int) -> InputState:
 
 
 def _beside(numbers: Array, leaf: Array) -> Array:
-    """Return numbers for messages with as many axes as the messages have."""
+    """Append axes to ``numbers (W,)`` until they broadcast with the leaf of ``W`` messages."""
     return numbers.reshape(*numbers.shape, *[1] * (leaf.ndim - numbers.ndim))
 
 
@@ -331,5 +331,5 @@ def _is_float(leaf: Array) -> bool:
 
 
 def _at_least_float32(leaf: Array) -> Array:
-    """Return a float leaf whose differences do not overflow: those of float16 do from 65,504 on."""
+    """Return a float leaf with at least 32 bits: differences of float16 overflow from 65,504 on."""
     return leaf.astype(jnp.float32) if leaf.dtype.itemsize < 4 else leaf

@@ -67,7 +67,7 @@ class Recorder(Protocol):
         """Take a step that has ended, and its output: a pytree of numpy arrays or numbers."""
 
     def message(self, record: MessageRecord) -> None:
-        """Take a message that was consumed, or that no step will consume any more."""
+        """Take a message, once a step has consumed it or no step can consume it any more."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class Steps:
 
     @property
     def begun(self) -> np.ndarray:
-        """Begin of each step, ``(N,)`` ticks [us]: the time that the step has set, else its start.
+        """Begin of each step, ``(N,)`` ticks [us]: the time that the step has set itself, otherwise its start.
 
         A sensor sets the time at which its sample was taken, so these are the samples' times.
         """

@@ -34,11 +34,11 @@ class Jitter(Enum):
     LATEST = "latest"
     """All arrived messages."""
     BUFFER = "buffer"
-    """Only those whose nominal arrival time has passed too."""
+    """Arrived messages whose nominal arrival time has passed, too."""
 
 
 class Connection:
-    """An input of ``input_node`` fed by the outputs of ``output_node``; made by ``BaseNode.connect``, see there.
+    """An input of ``input_node``, fed by the outputs of ``output_node``; ``BaseNode.connect`` makes it.
 
     Raises:
         UsageError: An option is out of its range, or two exclude each other.
@@ -89,7 +89,7 @@ class Connection:
 
     @property
     def total_window(self) -> int:
-        """Number of messages that the runtime keeps for the reader: the window, and more for a trainable delay."""
+        """Number of messages that the runtime keeps for the reader: ``window``, and more for a trainable delay."""
         extra = self.delay_dist.window(self.output_node.rate)
         if self.averaged:  # the mean also uses messages that arrive during the tick
             extra += math.ceil(self.output_node.rate / self.input_node.rate)
@@ -125,12 +125,12 @@ class BaseNode:
 
     Args:
         rate: Nominal frequency [Hz].
-        delay: Expected computation delay [s]; the schedules of readers start later by it. Default: the 0.99 quantile
-            of ``delay_dist``.
+                delay: Expected computation delay [s], by which the schedules of readers start later. Default: the 0.99
+            quantile of ``delay_dist``.
         delay_dist: Computation delay in simulation: a distrax distribution over seconds, a ``DelayDistribution`` or a
             number of seconds; default 0.
-        advance: Start as soon as the blocking inputs have arrived, even before the scheduled time. Needs a blocking
-            input; with a non-blocking input as well the schedule holds.
+        advance: Whether a step starts as soon as its blocking inputs have arrived, even before the scheduled time.
+            Needs a blocking input; without effect if another input does not block.
 
     Raises:
         UsageError: A rate or a delay is out of its range.
@@ -180,7 +180,7 @@ class BaseNode:
         jitter: Jitter = Jitter.LATEST,
         name: str | None = None,
     ) -> Connection:
-        """Feed an input of this node with the outputs of another.
+        """Feed an input of this node with the outputs of another node.
 
         Args:
             blocking: Whether a step waits for the messages that are due by the nominal schedule.
@@ -188,8 +188,9 @@ class BaseNode:
                 ``delay_dist``.
             delay_dist: Communication delay in simulation; may be a ``TrainableDist``; default 0.
             window: Number of last messages in the step state.
-            skip: Ignore this input in the node's phase (needed once in every loop of connections), and give messages
-                that arrive exactly at a step's start to the next step.
+            skip: Whether to ignore this input in the node's phase (needed once in every loop of connections), and to
+                give
+            messages that arrive exactly at a step's start to the next step.
             jitter: Treatment of messages that arrive early at a non-blocking input.
             name: Key in ``step_state.inputs``; default: the sender's name.
 
@@ -250,7 +251,7 @@ class BaseNode:
         return Empty()
 
     def init_output(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> PyTree:
-        """Return the default output: the message in a reader's window before the first real one has arrived."""
+        """Return the default output: the message in a reader's window before the first computed one arrives."""
         del rng, graph_state
         return Empty()
 
@@ -265,7 +266,7 @@ class BaseNode:
         return True
 
     def stop(self, timeout: float | None = None) -> bool:
-        """Make safe after an episode on the wall clock; called on every way out. Return False on a failure."""
+        """Make the hardware safe after an episode on the wall clock, however it ended. Return False on a failure."""
         del timeout
         return True
 

@@ -1,4 +1,4 @@
-"""The same graph of other node classes: rates, delays and connections are those of the old nodes."""
+"""Replaces nodes of a graph; rates, delays and connections stay."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def _replacement(old: BaseNode, other: Callable[..., BaseNode] | BaseNode) -> Ba
         open_ended = any(p.kind is p.VAR_KEYWORD for p in taken.values()) and not isinstance(old, BaseWorld)
         new = other(**{n: v for n, v in options.items() if n in taken or open_ended})
         if isinstance(new, BaseNode) and not isinstance(new, BaseWorld):
-            for name in (*_TIMING, *_LOOKS):  # also those that its constructor does not take
+            for name in (*_TIMING, *_LOOKS):  # also options that its constructor does not take
                 setattr(new, name, options[name])
     # Refuse a replacement that the connections do not fit.
     if not isinstance(new, BaseNode):

@@ -65,7 +65,7 @@ def next_drift(scheduling: Scheduling, scheduled, drift, previous_end):  # noqa:
 
 
 def _later(a, b):  # noqa: ANN001, ANN202
-    """Return the larger of two; of ints without numpy, which takes 4 % of a control process's time for them."""
+    """Return the larger of two. For ints without numpy, which would take 4 % of a control process's time."""
     return max(a, b) if isinstance(a, int) and isinstance(b, int) else np.maximum(a, b)
 
 

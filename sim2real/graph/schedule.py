@@ -1,4 +1,4 @@
-"""The schedule of a graph: delays in, timelines out, by the rules of ``rules``."""
+"""Turns delays of a graph into timelines, by the rules of ``rules.py``."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ def _computation_delays(node: BaseNode, duration_s: float, episodes: int, rng: n
 
 
 def _sampled(dist: DelayDistribution, rng: np.random.Generator, shape: tuple[int, ...], where: str) -> np.ndarray:
-    """Draw delays [ticks] and check them, as the distribution may be a user's own class."""
+    """Draw delays [ticks] and check them: a user may have written the distribution."""
     seconds = np.asarray(dist.sample(rng, shape))
     if seconds.shape != shape or not np.isfinite(seconds).all() or (seconds < 0).any():
         raise UsageError(
@@ -232,7 +232,7 @@ class _BlockingRun:
             self.received[key] = np.zeros_like(ends)
         arrivals = self.received[key]
         first = self.done[connection.name]
-        if upto > max(first, ends.shape[1]):  # a recorded sender that stops before its reader
+        if upto > max(first, ends.shape[1]):  # the recorded sender stops before its reader
             return np.full(len(arrivals), NEVER)
         # Messages arrive in order: none before the previous one.
         for m in range(first, upto):

@@ -42,8 +42,9 @@ class Timeline:
     def from_episode(episode: Episode, nodes: Mapping[str, BaseNode]) -> Timeline:
         """Return the timeline of one recorded episode (E = 1).
 
-        Messages with a trainable delay arrive at its smallest value, as in a drawn timeline: the record has them at the
-        delay of that time, and windows need them for any delay.
+                A trainable delay is set to its smallest value, as in a drawn timeline, so that windows hold the
+                messages for
+        any delay; the record has the arrivals at the delay during the recording.
 
         Args:
             nodes: The nodes by name; the timeline has those that are in the record, and connections between them.
@@ -110,11 +111,11 @@ def _edge(messages: Messages, sent: int, steps: int, sender: str) -> Edge:
 
 
 def _at_smallest_delay(connection: Connection, edge: Edge, episode: Episode, vertices: Mapping[str, Vertex]) -> Edge:
-    """Return an edge as drawn timelines have it: at the smallest value of a trainable delay."""
+    """Return the edge with a trainable delay set to its smallest value, as in drawn timelines."""
     if not isinstance(connection.delay_dist, TrainableDist):
         return edge
     steps, reader = episode.steps[connection.input_node.name], vertices[connection.input_node.name]
-    reader = Vertex(steps.start[None], reader.end, reader.count)  # not where a step has moved its start to
+    reader = Vertex(steps.start[None], reader.end, reader.count)  # the original start, even if the step has moved it
     return at_delay(connection, edge, reader, vertices[edge.sender], to_ticks(connection.delay_dist.min))
 
 

@@ -13,7 +13,7 @@ from sim2real.graph.times import NEVER, Edge, Vertex, search_rows
 EMPTY_AGE_S = 1e6
 """Age of an empty slot in a window [s]: older than any message."""
 _ROUNDING = 2
-"""Each slot is rounded to whole ticks, so the distance of two can be smaller than the period by this [ticks]."""
+"""Slots are rounded to whole ticks, so two slots can be closer than the period by this [ticks]."""
 
 
 def newest_message(edge: Edge, reader: Vertex) -> np.ndarray:
@@ -33,8 +33,8 @@ def overfull(
 ) -> np.ndarray:
     """Return the steps at which a trainable delay may need messages that are no longer in the window.
 
-    The window is long enough for a sender that keeps its rate. In a burst, the same number of messages spans less time:
-    at the largest delay, the message that a step should read has then left the window.
+    The window is long enough for a sender that keeps its rate. In a burst, the same number of messages spans less time,
+    so that at the largest delay the message that a step should read has left the window.
 
     Args:
         delay_s: The delay, where it does not change while the graph runs [s]; default: the largest one.
@@ -45,7 +45,7 @@ def overfull(
     dist = connection.delay_dist
     if not isinstance(dist, TrainableDist):
         return np.zeros(reader.start.shape, bool)
-    # The newest message that the window can offer at the largest delay (for a mean: the one that holds at the start).
+    # The message that the step reads at the largest delay (for a mean: the one that holds at the period's start).
     oldest = newest_message(edge, reader) - (connection.total_window - connection.window)
     if not (edge.seq_in.shape[1] and reader.start.shape[1]):
         return np.zeros(reader.start.shape, bool)
@@ -66,10 +66,10 @@ def bursty_episodes(nodes: Mapping[str, BaseNode], timeline: Timeline) -> np.nda
 def check_bursts(
     nodes: Mapping[str, BaseNode], timeline: Timeline, delays: Mapping[str, Mapping[str, TrainableDist]] | None = None
 ) -> None:
-    """Check that every window is long enough for every trainable delay within its bounds, or for given ``delays``.
+    """Check that every window is long enough for its trainable delay, anywhere within its bounds or as in ``delays``.
 
     Args:
-        delays: Node -> input -> the delay, where it does not change while the graph runs.
+        delays: Node -> input -> the delay, if it does not change while the graph runs.
     """
     for (name, input_name), edge in timeline.edges.items():
         if name not in nodes or input_name not in nodes[name].inputs:
@@ -92,7 +92,7 @@ def check_bursts(
 
 
 def make_room(nodes: Mapping[str, BaseNode], timeline: Timeline) -> dict[tuple[str, str], int]:
-    """Lengthen, in place, the windows with a trainable delay that are too short for the bursts of a timeline.
+    """Lengthen, in place, the windows of trainable delays that are too short for the bursts of a timeline.
 
     Otherwise ``check_bursts`` refuses such a timeline.
 

@@ -31,28 +31,29 @@ _INTERRUPTED_S = 1.0
 class AsyncGraph:
     """Runs a graph: on hardware in real time, or in simulation in the order of events.
 
-    There are two ways to run it. After ``start``, ``run_for`` and ``wait`` let the graph run, and the supervisor makes
-    its own steps. After ``reset``, as in a gym environment, each ``step`` takes the supervisor's output from the caller
-    and returns the supervisor's next step state. The graph stops when ``with graph:`` is left and when the interpreter
-    exits.
+        There are two ways to run it. After ``start``, ``run_for`` and ``wait`` let the graph run, and the supervisor
+        makes its own steps. After ``reset``, as in a gym environment, each ``step`` takes the supervisor's output from
+        the caller and returns the supervisor's next step state. The graph stops when ``with graph:`` is left and when
+        the interpreter exits.
 
-    A failure stops all nodes at once: each node's ``stop`` is called in the node's thread after its last step. The
-    waiting call, or else the next one, raises the failure with the node's name. A step that hangs is a failure too; as
-    its thread is busy, the node's ``stop`` is then called from another thread. The same applies to a node that is still
-    in its startup when the graph stops.
+        A failure stops all nodes at once: each node's ``stop`` is called in the node's thread after its last step. The
+        call that waits for the graph raises the failure, with the node's name; if none waits, the next call does. A
+        step that
+    hangs is a failure too: its thread is busy, so another thread calls the node's ``stop``. The same applies to a node
+    that is still in its startup when the graph stops.
 
     Args:
-        nodes: The nodes, by name or as a list.
-        supervisor: The node at whose steps ``reset``, ``step`` and ``run`` return, usually the policy.
-        clock: The clock; a ``MonotonicClock`` is the wall clock with the time of this object, e.g. of a test.
-        duration_s: Length of drawn timelines [s]; the simulated clock needs this or ``timeline``.
-        timeline: Timelines to play; the graph state's ``eps`` selects the episode. Simulated clock only.
-        timeout_s: Longest wait of a call for the next step, and of the supervisor for its caller [s].
-        step_timeout_s: Time after which a step of any node counts as hanging, which stops the graph [s]; 0: never;
-            default: ten periods of its node, at least 1 s. The caller's time does not count. Wall clock only.
+            nodes: The nodes, by name or as a list.
+            supervisor: The node at whose steps ``reset``, ``step`` and ``run`` return, usually the policy.
+            clock: The clock; a ``MonotonicClock`` is the wall clock with the time of this object, e.g. of a test.
+            duration_s: Length of drawn timelines [s]; the simulated clock needs this or ``timeline``.
+            timeline: Timelines to play; the graph state's ``eps`` selects the episode. Simulated clock only.
+            timeout_s: Longest wait of a call for the next step, and of the supervisor for its caller [s].
+            step_timeout_s: Time after which a step of any node counts as hanging, which stops the graph [s]; 0: never;
+                default: ten periods of its node, at least 1 s. The caller's time does not count. Wall clock only.
 
     Raises:
-        UsageError: The nodes do not form a graph, or an option does not fit the clock.
+            UsageError: The nodes do not form a graph, or an option does not fit the clock.
     """
 
     def __init__(
@@ -104,10 +105,10 @@ class AsyncGraph:
         self._prepare(graph_state)
 
     def start(self, graph_state: GraphState, timeout_s: float = 60.0) -> None:
-        """Start an episode in which the supervisor makes its own steps.
+        """Start an episode in which the supervisor's ``step`` is called like that of every other node.
 
         Args:
-            timeout_s: Longest time of the nodes' startups [s]; after a failure stopping may take the same time.
+            timeout_s: Longest time of the nodes' startups [s]; after a failure, stopping may take as long again.
 
         Raises:
             UsageError: The graph is running.
@@ -120,11 +121,13 @@ class AsyncGraph:
     def stop(self, timeout_s: float = 10.0) -> None:
         """Stop the graph, at any time and from any thread; without effect on a stopped graph.
 
-        A start in progress is ended too: after this call no node's startup is running or will run. A signal's handler
-        raises an exception instead, as that of Ctrl-C does: leaving ``with graph:`` then stops the graph.
+                A start in progress is ended too: after this call no node's startup is running or will run. Do not call
+                    this in a
+        signal handler: raise an exception there, as Ctrl-C does, and leaving ``with graph:`` stops the graph.
 
         Raises:
-            Sim2RealError: The failure that stopped the graph, if no call has raised it yet; or a node did not end.
+                    Sim2RealError: The failure that stopped the graph, if no call has raised it yet; or a node did not
+                        end.
         """
         with self._lock:
             self._stops += 1
@@ -133,11 +136,11 @@ class AsyncGraph:
             if run is not None:
                 run.stop(timeout_s)
         finally:
-            if run is None or run.stopped:  # else it was interrupted, and the exit of the interpreter tries again
+            if run is None or run.stopped:  # after an interruption, the interpreter's exit tries again
                 atexit.unregister(self.stop)
 
     def run_for(self, duration_s: float) -> GraphState:
-        """Let the graph run for a while, the supervisor making its own steps, and return the graph's state.
+        """Let the graph run for ``duration_s``, with the supervisor's own ``step``; return the graph's state.
 
         On the simulated clock all steps are made that start within the next ``duration_s`` seconds. Returns early if
         another thread stops the graph. If the graph was started with ``reset``, the caller makes the steps again
@@ -184,7 +187,7 @@ class AsyncGraph:
         return run.snapshot(), observed
 
     def run(self, graph_state: GraphState) -> GraphState:
-        """Run to the end of the supervisor's next step, made by its own ``step``; start the graph if it is stopped."""
+        """Run until the supervisor's own ``step`` has made its next step; start the graph if it is stopped."""
         run = self._run if self.running and self._run else self._restart(graph_state)
         run.observe(self._timeout_s)
         run.settle(run.reply(Reply()), self._timeout_s)
@@ -272,7 +275,7 @@ class AsyncGraph:
         else:
             run = WallClockRun(*common, self._monotonic, self._timeout_s, self._step_timeout_s)
 
-        # Publish it, so that stop() in another thread finds it, and begin.
+        # Publish the run, so that stop() in another thread finds it; then begin.
         with self._lock:
             if self._stops != stops:
                 raise Sim2RealError("the graph was stopped while it started", hint="call start() or reset() again")
@@ -308,7 +311,7 @@ class AsyncGraph:
             raise UsageError("the graph is not running", hint="call start() or reset() first")
         self._run.check()
         if self._run.ended:
-            self._run.check()  # it may have failed since the first check
+            self._run.check()  # the run may have failed since the first check
             raise UsageError("the graph has been stopped", hint="call start() or reset() to run it again")
         return self._run
 

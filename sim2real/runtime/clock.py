@@ -31,8 +31,9 @@ class Clock(Enum):
 class MonotonicClock:
     """Ticks [us] since the episode's start, on the machine's monotonic clock; negative before it.
 
-    The threads of a graph read the time and wait for each other through this class alone: that of an emulated robot
-    passes only while every thread waits, see ``VirtualClock``.
+        The threads of a graph read the time and wait for each other through this class alone, so that ``VirtualClock``
+        can
+    replace it for an emulated robot.
     """
 
     event, condition, lock = threading.Event, threading.Condition, threading.Lock
@@ -65,7 +66,7 @@ class MonotonicClock:
         thread.start()
 
     def keep_time(self) -> None:
-        """Give the calling thread a real-time priority; see the function."""
+        """Give the calling thread a real-time priority; see the function ``keep_time``."""
         keep_time()
 
     def sleep_past(self, tick: int, stopping: threading.Event) -> bool:
@@ -82,12 +83,12 @@ class MonotonicClock:
 def keep_time() -> None:
     """Give the calling thread a real-time priority, if the operating system allows it.
 
-    Processes and threads that are started from this one do not inherit it. On Linux it needs root, or a limit for
-    real-time priorities (``ulimit -r``) of at least 3. Three nodes at 500 Hz beside an emulated bus on two
-    processors: the latest wake-up in a hundred is 0.2 to 0.4 ms late with it, 0.9 to 1.9 ms without.
+    Processes and threads that this one starts do not inherit the priority. On Linux it needs root, or a limit for
+    real-time priorities (``ulimit -r``) of at least 3. Three nodes at 500 Hz beside an emulated bus on two processors:
+    the 0.99 quantile of the lateness of wake-ups is 0.2 to 0.4 ms with the priority, 0.9 to 1.9 ms without.
     """
     with suppress(AttributeError, OSError):
-        # If the guardian's higher priority is not allowed, this thread takes none either.
+        # The guardian needs a higher priority than this thread: if the system refuses that one, this thread takes none.
         for priority in (_GUARDIAN_PRIORITY, _PRIORITY):
             os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
 
@@ -99,7 +100,7 @@ _realtime_before: tuple[bool, float, bool] = (True, 0.005, False)
 
 @contextmanager
 def realtime() -> Iterator[None]:
-    """Keep the interpreter from pausing control threads; wall-clock episodes call this.
+    """Keep the interpreter from pausing control threads, in a ``with`` block around an episode on the wall clock.
 
     On entry the garbage collector runs once and is then switched off: reference cycles made inside the block are not
     freed before its end (the runtime's own steps make none). Objects alive at entry are frozen (``gc.freeze``). The
@@ -108,7 +109,7 @@ def realtime() -> Iterator[None]:
     """
     global _realtime_users, _realtime_before
     with _realtime_lock:
-        # The first user changes the settings of the process.
+        # The outermost block changes the settings of the process.
         _realtime_users += 1
         if _realtime_users == 1:
             _realtime_before = (gc.isenabled(), sys.getswitchinterval(), gc.get_freeze_count() > 0)
@@ -120,7 +121,7 @@ def realtime() -> Iterator[None]:
         yield
     finally:
         with _realtime_lock:
-            # The last user restores them.
+            # The block that ends last restores them.
             _realtime_users -= 1
             if _realtime_users == 0:
                 enabled, interval, frozen = _realtime_before

@@ -18,7 +18,7 @@ from sim2real.errors import UsageError
 from sim2real.installation import has_jax
 
 VARIABLE = "SIM2REAL_CACHE"
-"""A folder, or ``off``."""
+"""Environment variable with the folder of the cache, or ``off``."""
 OFF = "off"
 _JAX = "JAX_COMPILATION_CACHE_DIR"
 _MAX_BYTES = 2 * 2**30
@@ -58,7 +58,7 @@ def enable() -> Path | None:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
-    except OSError:  # a home directory that is read-only or full: compiling takes longer, and that is all
+    except OSError:  # the home directory is read-only or full: every run compiles anew
         return None
 
     # Remove old programs (JAX's own limit needs a further package, and a lock for each program), then set the folder
@@ -75,9 +75,9 @@ def enable() -> Path | None:
 
 
 def _machine() -> str:
-    """Return a name for machines that can run each other's programs: processor features, Python's and JAX's versions.
+    """Return a name that two machines share if they can run each other's programs.
 
-    XLA compiles for the features of the processor at hand; another one may stop at an unknown instruction.
+    XLA compiles for the features of this machine's processor; another processor may stop at an unknown instruction.
     """
     features = platform.processor()
     with contextlib.suppress(OSError):

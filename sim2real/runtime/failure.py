@@ -41,7 +41,7 @@ def named(error: BaseException, node: str, during: str) -> Sim2RealError:
 
 @contextmanager
 def noted(error: BaseException) -> Iterator[None]:
-    """Add an exception of the block to ``error`` as a note, in place of raising it: ``error`` is being raised."""
+    """Add an exception that the block raises to ``error`` as a note, instead of raising it."""
     try:
         yield
     except Exception as other:

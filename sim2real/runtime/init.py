@@ -31,9 +31,9 @@ class Bounds(NamedTuple):
     """The numbers of a ``TrainableDist``, each of shape ``()``.
 
     Attributes:
-        low: Its smallest delay [s].
-        span: Its largest delay minus the smallest [s].
-        alpha: Its position between the bounds, in [0, 1].
+                low: Smallest delay [s].
+        span: Largest delay minus the smallest [s].
+        alpha: Position of the delay between the bounds, in [0, 1].
     """
 
     low: Number
@@ -48,7 +48,7 @@ class Bounds(NamedTuple):
         return dist.replace(alpha=jnp.clip(alpha, 0.0, 1.0))
 
     def opened(self, dist: TrainableDist) -> TrainableDist:
-        """Return a distribution with the same delay and the bounds 0 and 1 s, which are the same in each program."""
+        """Return a distribution with the same delay and the bounds 0 and 1 s, which all programs share."""
         return dist.replace(alpha=self.low + dist.alpha * self.span, min=0.0, max=1.0)
 
 
@@ -100,8 +100,8 @@ def init_graph_state(
 ) -> GraphState:
     """Return the state in which a graph starts; a pure function that can be traced and mapped.
 
-    Each ``init_*`` method gets the graph state with all parts made before. A node's keys depend on ``rng`` and its name
-    alone.
+    Each ``init_*`` method gets the graph state that is filled so far. A node's keys depend only on ``rng`` and its
+    name.
 
     Args:
         rng: JAX's key; None: no node gets random numbers.

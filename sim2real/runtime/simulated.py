@@ -27,8 +27,9 @@ _NEVER = 2**62
 class _Link:
     """One connection of the timeline: the messages that each step consumes, and those that the log records.
 
-    The two differ for a trainable delay: the window takes messages in at the smallest delay, and the step picks those
-    that have arrived at the current delay. The log has the arrivals at the current delay.
+        The two differ for a trainable delay. The window takes messages in as if the delay were the smallest, and the
+        step
+    picks those that have arrived at the current delay; the log has the arrivals at the current delay.
     """
 
     def __init__(self, edge: Edge, recorded: Edge, episode: int, steps: int) -> None:
@@ -92,7 +93,7 @@ class _Player:
 
 
 def _recorded_edge(data: NodeData, name: str, timeline: Timeline) -> Edge:
-    """Return an input's messages at its current delay; that of a trainable one may differ from the timeline's."""
+    """Return an input's messages at its current delay, which for a trainable delay may differ from the timeline's."""
     node = data.node
     edge, dist = timeline.edges[node.name, name], data.windows[name].state.delay_dist
     if not isinstance(dist, TrainableDist):
@@ -187,7 +188,7 @@ class SimulatedRun:
         """Do nothing: a step is finished when ``reply`` returns."""
 
     def run_for(self, duration_s: float) -> None:
-        """Run all steps that start within the next ``duration_s``, the supervisor making its own."""
+        """Run all steps that start within the next ``duration_s``, with the supervisor's own ``step``."""
         self._run_until(self._now + to_ticks(duration_s), None)
 
     def wait(self, timeout_s: float | None) -> bool:
@@ -239,8 +240,8 @@ class SimulatedRun:
         return True
 
     def _event(self) -> None:
-        """Make the step that comes next in time, or offer it to the caller; do nothing in a stopped graph."""
-        # Choose the earliest step whose messages are there.
+        """Make the next step, or offer it to the caller if it is the supervisor's; do nothing in a stopped graph."""
+        # Choose the earliest step whose messages have all been sent.
         ready = [p for p in self._players.values() if p.begins[p.k] < _NEVER and p.ready(self._players)]
         if not ready:
             raise Sim2RealError(

@@ -22,9 +22,10 @@ class NodeStatistics(NamedTuple):
         period_s: Time from one step's wake-up to the next one's.
         lateness_s: Time from a step's start by the timing rules to its wake-up.
         overruns: Number of steps that started late only because the previous step had not ended.
-        age_s: Input -> age of the newest message at a step's start, since it was sent: the age of the data that a
-            policy acts on. Without inputs that had no message; on the simulated clock also without those that have a
-            trainable delay, as there the step picks the message.
+                age_s: Input -> time from the sending of its newest message to a step's start: the age of the data that
+                    a policy
+            acts on. Inputs without a message are left out; on the simulated clock also inputs with a trainable delay,
+            whose message the step itself picks.
     """
 
     steps: int
@@ -70,7 +71,7 @@ class StepLog:
 
     def summary(self) -> NodeStatistics:
         """Return the statistics so far."""
-        count = len(self._late)  # read once: the node's thread may add more meanwhile
+        count = len(self._late)  # copy first: the node's thread may append meanwhile
         return NodeStatistics(
             steps=count,
             period_s=quantiles(np.diff(self._woken[:count])),

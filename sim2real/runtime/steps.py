@@ -39,7 +39,7 @@ class Message(NamedTuple):
 
 
 class Format:
-    """The structure, shapes and dtypes of a node's output: those of its default output.
+    """The structure, shapes and dtypes of a node's outputs, taken from its default output.
 
     Args:
         default: The default output.
@@ -126,7 +126,8 @@ class NodeData:
             clock, where the messages' delays are real.
 
     Attributes:
-        carried: ``(rng, params, state, number of steps)``; replaced as a whole, so other threads can read it any time.
+        carried: ``(rng, params, state, number of steps)``; replaced as a whole, so that other threads can read it at
+            any time.
     """
 
     def __init__(self, node: BaseNode, graph_state: GraphState, emulate_delays: bool) -> None:
@@ -159,7 +160,7 @@ class NodeData:
         return StepState(rng, state, params, inputs, self._eps, np.int32(seq), ts)
 
     def ages(self, tick: int) -> dict[str, np.ndarray]:
-        """Return the ages of the messages, for inputs with a trainable delay that is applied; see ``Window.ages``."""
+        """Return the ages of the messages [s] of each input whose trainable delay is applied; see ``Window.ages``."""
         return {name: self.windows[name].ages(tick) for name in self._emulated}
 
     def keep(self, changed: dict[str, PyTree]) -> None:
@@ -181,7 +182,7 @@ def snapshot(graph_state: GraphState, data: dict[str, NodeData], supervisor: str
 
 
 def _shift(old: np.ndarray, entries: Sequence[int | np.ndarray]) -> np.ndarray:
-    """Return ``old`` with new entries at its end and as many dropped at its start; at most ``len(old)`` new ones."""
+    """Drop as many entries at the start of ``old`` as ``entries`` has, at most all, and append ``entries``."""
     out = np.empty_like(old)
     count = len(entries)
     out[: len(old) - count] = old[count:]
@@ -198,7 +199,7 @@ class Result(NamedTuple):
     """The results of a step.
 
     Attributes:
-        changed: The replaced ones of ``rng``, ``params`` and ``state``.
+        changed: Those of ``rng``, ``params`` and ``state`` that the step replaced.
         ts: The start that the step has set [s], or None.
         leaves: The output, as ``Format.pack`` returns it.
     """
@@ -226,7 +227,7 @@ class Reply(NamedTuple):
 
 
 class Stepper:
-    """Runs the steps of one node, for any number of episodes; compiles when the first is prepared."""
+    """Runs the steps of one node in any number of episodes; compiles before the first."""
 
     def __init__(self, node: BaseNode) -> None:
         self.node = node
@@ -259,7 +260,7 @@ class Stepper:
 
             traced = jax.jit(call).trace(*arguments)
             self._compiled = traced.lower().compile()
-            if not traced.jaxpr.effects:  # no side effects: a first call, whose result is dropped, fills caches
+            if not traced.jaxpr.effects:  # without side effects: call it once to fill caches, and drop the result
                 jax.block_until_ready(self._compiled(*arguments))
         self._signature = signature
 
@@ -333,7 +334,7 @@ def overwritten(ts: Number | None, begin: int, now: int, node: str) -> int:
 
 
 def _changed(before: StepState, new: StepState) -> dict[str, PyTree]:
-    """Return the fields that a step replaced; the others need not be outputs of the compiled program."""
+    """Return the fields that a step replaced: only they must be outputs of the compiled program."""
     return {f: getattr(new, f) for f in (*_CARRIED, "ts") if getattr(new, f) is not getattr(before, f)}
 
 

@@ -21,7 +21,7 @@ _CHUNK = 1024
 
 
 class Table:
-    """The values of a vectorised function of the step number, computed in chunks: cheaper than one numpy call a step.
+    """A function of the step number, evaluated for many steps at once: cheaper than one numpy call for each step.
 
     Args:
         rule: Maps step numbers, shape ``(n,)``, to integers of the same shape.
@@ -111,7 +111,7 @@ class MessageChannel:
         return (self._record(m, k) for m in taken)
 
     def leftover(self) -> Iterator[MessageRecord]:
-        """Return the records of messages that no finished step consumed, once; called when both threads have ended."""
+        """Return the records of messages that no finished step consumed; called once, when both threads have ended."""
         rest, self._taken = [*self._taken, *self._queue], []
         self._queue.clear()
         return (self._record(m, -1) for m in rest)
@@ -129,7 +129,7 @@ class Handover:
     """The supervisor offers its step state and waits; the caller observes it and replies.
 
     Args:
-        autonomous: Whether the node makes its own steps at first, without waiting for a caller.
+        autonomous: Whether the node's own ``step`` is called at first, without waiting for a caller.
     """
 
     def __init__(self, autonomous: bool, clock: MonotonicClock) -> None:
@@ -142,11 +142,11 @@ class Handover:
 
     @property
     def autonomous(self) -> bool:
-        """Whether the node makes its own steps."""
+        """Whether the node's own ``step`` is called."""
         return self._autonomous
 
     def set_autonomous(self, autonomous: bool) -> None:
-        """Let the node, or else the caller, make the steps from now on, the one on offer included."""
+        """Let the node (True) or the caller (False) make all steps from now on, also the one on offer."""
         with self._condition:
             self._autonomous = autonomous
             if autonomous:
@@ -192,20 +192,20 @@ class Handover:
             self._condition.notify_all()
 
     def observe(self, timeout_s: float) -> StepState | None:
-        """Wait for a step on offer and return it; None after a timeout or when the graph stopped. For the caller."""
+        """Wait for a step on offer and return it; None after a timeout or a stop. Called by the caller."""
         with self._condition:
             self._condition.wait_for(lambda: self._offered is not None or self._closed, timeout_s)
             return None if self._closed else self._offered
 
     def reply(self, reply: Reply) -> int:
-        """Reply to the step on offer, for the caller; return the number of finished steps after it."""
+        """Reply to the step on offer; return the number of finished steps after it. Called by the caller."""
         with self._condition:
             self._offered, self._reply = None, reply
             self._condition.notify_all()
             return self._finished + 1
 
     def settle(self, finished: int, timeout_s: float) -> bool:
-        """Wait until ``finished`` steps are finished, for the caller; return False after a timeout."""
+        """Wait until ``finished`` steps are finished; return False after a timeout. Called by the caller."""
         with self._condition:
             self._condition.wait_for(lambda: self._finished >= finished or self._closed, timeout_s)
             return self._finished >= finished
@@ -255,7 +255,7 @@ class Shared:
             self.stop()
 
     def deliver(self) -> Sim2RealError | None:
-        """Return the failure at the first call; None if there is none, or at later calls."""
+        """Return the failure at the first call, so that it is raised once; None at later calls, or without one."""
         with self._lock:
             failure = None if self._delivered else self.failure
             self._delivered = self._delivered or failure is not None
@@ -265,15 +265,15 @@ class Shared:
 class NodeThread(threading.Thread):
     """Runs a node's startup, steps and stop in one thread, so that ``stop`` comes after the last step.
 
-    If the startup or a step hangs, another thread calls ``stop``. Should the hanging call return later, this thread
-    calls ``stop`` again, as that call may have switched something on.
+    If the startup or a step hangs, another thread calls ``stop``. If the hanging call returns later, this thread calls
+    ``stop`` again, because the call may have switched something on.
 
     Args:
         handover: Synchronises the supervisor with its caller; None for the other nodes.
 
     Attributes:
         ready: Set once the startup has succeeded or failed.
-        over: Set when the thread has ended, or its step hangs: other threads need not wait for it any more.
+                over: Set when the thread has ended, or its step hangs: nobody waits for it any more.
         made_safe: Whether another thread has called the node's ``stop``.
         failed: Whether the graph stopped because a step of this node hangs.
         during: The call in progress: ``startup``, ``step 12`` or ``stop``.
@@ -306,7 +306,7 @@ class NodeThread(threading.Thread):
             if not self.shared.stopping.is_set():
                 self._live()
         finally:
-            self.shared.stop()  # whatever ended this thread: no graph runs without one of its nodes
+            self.shared.stop()  # any exception stops the graph: no graph runs without one of its nodes
             self.ready.set()
             self.over.set()
 
@@ -335,7 +335,7 @@ class NodeThread(threading.Thread):
             self.since_s = None
             self.ready.set()
             self.shared.go.wait()
-            self.shared.clock.keep_time()  # not before: a startup may compute for long
+            self.shared.clock.keep_time()  # only now, as the startup may have computed for a long time
             self._loop()
         except Stopped:
             pass
@@ -393,7 +393,7 @@ class NodeThread(threading.Thread):
     def _step(self, k: int, begin: int) -> Result:
         offered = self.data.step_state(k, begin)
         reply = self.handover.meet(offered, self.shared.answer_timeout_s) if self.handover else Reply()
-        self.since_s = self.shared.clock.monotonic_s()  # only now: the caller's time does not count
+        self.since_s = self.shared.clock.monotonic_s()  # only now, as the caller's time does not count
         return self.stepper.answer(self.data, offered, {}, reply)
 
     def _record(self, record: StepRecord, result: Result) -> None:

@@ -11,7 +11,7 @@ from sim2real.runtime.clock import MonotonicClock
 _HANGS_S: Final = 120.0
 """Longest time for which a thread may compute without waiting [s], on the machine's clock."""
 _INTERRUPTED_HANGS_S: Final = 2.0
-"""The same after Ctrl-C [s]."""
+"""Longest time for which a thread may compute after Ctrl-C [s]."""
 
 
 class Time(Protocol):
@@ -38,15 +38,16 @@ class _Waiting:
 class VirtualClock(MonotonicClock):
     """The clock of an emulated robot, for the graph that drives it.
 
-    The threads of the graph, and the one that makes this clock, take turns: one runs, until it waits or ends, and then
-    the one whose time comes first. When all wait, time jumps to the next deadline. Computing takes no time, so that
-    episodes are the same on a busy machine, and each time.
+        The threads of the graph, and the thread that makes this clock, take turns: one runs until it waits or ends;
+            then the
+    thread whose deadline comes first runs. When all wait, time jumps to that deadline. Computing takes no time, so
+    episodes are equal on every machine and in every repetition.
     """
 
     def __init__(self, time: Time) -> None:
         self._time = time
         self._mutex = threading.RLock()
-        self._turn: threading.Thread | None = threading.current_thread()  # None: who has it ended while nobody waited
+        self._turn: threading.Thread | None = threading.current_thread()  # None: it ended while no other waited
         self._waiting: dict[threading.Thread, _Waiting] = {}
         self._hangs = False
         super().__init__()
@@ -93,7 +94,7 @@ class VirtualClock(MonotonicClock):
         return _Waiting(predicate, deadline, threading.Condition(self._mutex))
 
     def _await_turn(self, me: threading.Thread, waiting: _Waiting) -> None:
-        """Give the turn away, and return when this thread has it again, or a thread hangs."""
+        """Pass the turn on, and return when this thread has it again, or when another thread hangs."""
         has_turn = lambda: self._turn is me or self._hangs  # noqa: E731
         with self._mutex:
             try:
@@ -101,19 +102,19 @@ class VirtualClock(MonotonicClock):
                 if not waiting.wake.wait_for(has_turn, _HANGS_S):
                     self._hangs = True
             except BaseException:
-                # Ctrl-C: this thread goes on when no other is in the middle of something.
+                # After Ctrl-C this thread goes on once the running thread waits.
                 waiting.predicate = lambda: True
                 if not waiting.wake.wait_for(has_turn, _INTERRUPTED_HANGS_S):
                     self._hangs = True
                 raise
             finally:
                 del self._waiting[me]
-                if self._hangs:  # nobody waits any more: the graph's watchdog and its stop find who hangs
+                if self._hangs:  # no thread waits for its turn any more; the graph's watchdog finds the one that hangs
                     for other in self._waiting.values():
                         other.wake.notify()
 
     def _pass_on(self, me: threading.Thread) -> None:
-        """Give this thread's turn to the one whose time comes first, and let time pass until then."""
+        """Pass this thread's turn to the thread whose deadline comes first, and let time pass until then."""
         with self._mutex:
             if self._turn is me and not self._waiting:
                 self._turn = None
@@ -126,12 +127,14 @@ class VirtualClock(MonotonicClock):
                     return
                 deadline = min(w.deadline for w in self._waiting.values())
                 if deadline == float("inf"):
-                    raise Sim2RealError(f"all threads wait for ever: {', '.join(t.name for t in self._waiting)}")
+                    raise Sim2RealError(
+                        f"every thread waits, none has a deadline: {', '.join(t.name for t in self._waiting)}"
+                    )
                 self._time.sleep(1e-9 * (deadline - now))
 
 
 class _Condition:
-    """A condition: one thread runs at a time, so that there is nothing to lock, and nobody to notify."""
+    """A condition variable without lock and notification: only one thread runs at a time."""
 
     def __init__(self, clock: VirtualClock) -> None:
         self.wait_for = clock.wait_for

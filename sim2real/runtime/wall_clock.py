@@ -26,7 +26,7 @@ class WallClockRun:
     Args:
         recorder: Receives all steps and messages, or None.
         timeout_s: Longest wait of the supervisor for its caller [s].
-        step_timeout_s: Longest time of a step, see ``step_limits``.
+        step_timeout_s: Longest time of a step [s]; see ``step_limits``.
     """
 
     def __init__(
@@ -110,7 +110,7 @@ class WallClockRun:
             raise Sim2RealError("the graph was stopped while it started", hint="call start() or reset() again")
 
     def check(self) -> None:
-        """Stop the graph and raise its failure, if it has one that was not raised yet."""
+        """If the graph has a failure that was not raised yet, stop the graph and raise the failure."""
         if self._shared.failure is not None:
             self.stop(self._shared.timeout_s)
 
@@ -139,7 +139,7 @@ class WallClockRun:
             self._missing(f"the supervisor {self._supervisor!r} has not finished its step after {timeout_s:g} s")
 
     def run_for(self, duration_s: float) -> None:
-        """Let the graph run for ``duration_s``, the supervisor making its own steps; return early if it is stopped."""
+        """Let the graph run for ``duration_s``, with the supervisor's own ``step``; return early if it is stopped."""
         self._handover.set_autonomous(True)
         self._shared.stopping.wait(duration_s)
         self.check()
@@ -232,12 +232,13 @@ class WallClockRun:
 
 
 MIN_LIMIT_S, PERIODS = 1.0, 10.0
-"""By default a step counts as hanging after ``PERIODS`` periods of its node, but not before ``MIN_LIMIT_S`` [s]: on a
-busy laptop a step can be delayed by a few hundred milliseconds."""
+"""A step counts as hanging after ``PERIODS`` periods of its node, at least ``MIN_LIMIT_S`` [s]: a busy laptop can delay
+a step by a few hundred milliseconds.
+"""
 LAST_RESORT_S = 1.0
-"""Longest wait for a node's ``stop`` that another thread than the node's calls [s]."""
+"""Longest wait for a node's ``stop`` when another thread calls it [s]."""
 _GRACE_S = 0.2
-"""Longest time of a startup after the graph was stopped, before the node's ``stop`` is called [s]."""
+"""Time for which a startup may go on after the graph stopped; then another thread calls the node's ``stop`` [s]."""
 
 
 def step_limits(nodes: Mapping[str, BaseNode], limit_s: float | None) -> dict[str, float]:
@@ -263,7 +264,7 @@ class Watchdog(threading.Thread):
         self._quit, self._over = shared.clock.event(), shared.clock.event()
 
     def run(self) -> None:
-        """Check the threads until the graph has stopped; whatever ends this thread earlier stops the graph."""
+        """Check the threads until the graph has stopped; an exception in this thread stops the graph."""
         try:
             self._shared.clock.keep_time()
             self._watch()
@@ -312,6 +313,6 @@ class Watchdog(threading.Thread):
                 )
             )
         thread.make_safe_from_outside(LAST_RESORT_S)
-        if during != "startup":  # a startup may still end, after which its thread calls stop and ends
+        if during != "startup":  # a startup may still return: then its thread calls stop itself
             thread.over.set()
         return limit

@@ -253,7 +253,7 @@ def test_errors_instead_of_silence(compiled):
     graph = compiled(topologies.pair)
     gs = graph.init(KEY)
     for call in (graph.step, lambda s: graph.advance(s, None, None), jax.jit(graph.step)):
-        with pytest.raises(UsageError, match=r"step of the supervisor 'policy' awaits"):
+        with pytest.raises(UsageError, match=r"step of the supervisor 'policy' is due"):
             call(gs)
     awaiting, ss = jax.jit(graph.reset)(gs)
     step = jax.jit(graph.step)

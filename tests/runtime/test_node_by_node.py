@@ -229,7 +229,7 @@ def test_a_shorter_episode_has_no_messages_of_steps_that_are_not_made():
 
 def test_a_loop_among_computed_nodes_is_refused_and_given_outputs_open_it():
     nodes, _ = topologies.robot(jax_hash_node)
-    with pytest.raises(UsageError, match=r"hear each other in a loop: \w+ -> \w+") as error:
+    with pytest.raises(UsageError, match=r"read each other's messages in a loop: \w+ -> \w+") as error:
         OpenLoopGraph(nodes, "sensor", ())
     assert all(n in str(error.value) for n in ("world", "sensor", "policy", "actuator"))
     assert "give the recorded outputs of one of them" in (error.value.hint or "")

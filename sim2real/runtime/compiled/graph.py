@@ -93,8 +93,8 @@ class CompiledGraph:
         check_fit(self.nodes, timeline, {})
         self.wiring: Wiring = wire(self.nodes, self.supervisor, timeline, reusable)
         self.program = RowProgram(self.nodes, self.wiring, timeline.episodes, reusable)
-        # The supervisor may have several slots in a row; the i-th is its turn i. Where each of its steps is, `(E, K)`:
-        # row * turns + turn; behind the last row if the program does not compute it.
+        # The supervisor may have several slots in a row; call them its turns. Step k of episode e is computed at # `row
+        # * turns + turn`, shape `(E, K)`; a step that the program does not compute lies behind the last row.
         self._turns = [i for i, n in enumerate(self.wiring.slots) if n == self.supervisor]
         self._behind = self.rows * len(self._turns)
         self._places = np.zeros((self.episodes, 0), np.int64)
@@ -103,8 +103,8 @@ class CompiledGraph:
             self._places = np.full((self.episodes, int(seq.max()) + 1), self._behind)
             e, at = np.nonzero(seq >= 0)
             self._places[e, seq[e, at]] = at
-        # Unrolling halves a GPU's copies of the carried state: 100,000 pendulums on an H200 take 0.63 of the time. On a
-        # CPU it costs time to compile.
+        # On a GPU, unrolling halves the copying of the carried state: 100,000 pendulums on an H200 take 0.63 of the
+        # time. On a CPU it costs time to compile.
         self._has_other_data = False
         self._rows_per_pass = 1 if jax.default_backend() == "cpu" else 2
 
@@ -137,7 +137,7 @@ class CompiledGraph:
         return int(self._counts().min())
 
     def last_row(self, steps: np.ndarray) -> np.ndarray:
-        """Return the row of the last of the supervisor's first ``steps (E,)`` steps in each episode, ``(E,)``."""
+        """Return the row of step ``steps - 1`` of the supervisor in each episode; both of shape ``(E,)``."""
         computed = (np.arange(self._places.shape[1]) < steps[:, None]) & (self._places < self._behind)
         return np.where(computed, self._places, 0).max(axis=1, initial=0) // max(1, len(self._turns))
 
@@ -164,7 +164,7 @@ class CompiledGraph:
         outputs = gs.aux[OUTPUTS]
         buffer = {name: (outputs[name],) * length for name, length in self.wiring.rings.items() if length}
         aux = {k: v for k, v in gs.aux.items() if k != OUTPUTS}
-        # A numpy number, not a traced one: code later in the same program can see that this is the first row.
+        # A numpy number, not a traced one: later code can then see that this is the first row.
         return gs.replace(eps=jnp.asarray(eps, jnp.int32), step=np.int32(0), seq={}, buffer=buffer, aux=aux)
 
     def reset(self, gs: GraphState) -> tuple[GraphState, StepState]:
@@ -212,17 +212,18 @@ class CompiledGraph:
         return self._at_step(*self._play_on(gs, turn, k < 0, int(np.diff(self._places, axis=1).max(initial=1))))
 
     def run(self, gs: GraphState) -> GraphState:
-        """Make the supervisor's next step by its own ``step``, and run to the step after it.
+        """Call the supervisor's own ``step``, and run until its next step is due.
 
-        A state from ``init`` is reset first. With a scan, call ``reset`` before the loop: it adds an entry to ``seq``,
-        and a loop's carry must keep its structure.
+                A state from ``init`` is reset first. Before a ``lax.scan`` call ``reset``: it adds an entry to ``seq``,
+                    and the
+        carry of a scan must keep its structure.
         """
         return self.step(gs if gs.seq else self.reset(gs)[0])[0]
 
     def rollout(
         self, gs: GraphState, record: Sequence[str] = (), rows: int | None = None
     ) -> tuple[GraphState, dict[str, Rollout]]:
-        """Run the rows of an episode, the supervisor making its own steps.
+        """Run the rows of an episode with the supervisor's own ``step``.
 
         Args:
             rows: Number of rows; default: all remaining rows, or the whole episode if ``gs.step`` is traced.
@@ -250,7 +251,7 @@ class CompiledGraph:
         end, records = scan_rows(run_row, gs, record, rows, self._rows_per_pass)
         if not (inside and _traced(gs.eps)):
             return end, records
-        # The rows' updates are not masked: there is no result where a traced ``eps`` is no episode.
+        # The rows' updates are not masked: the result of a traced ``eps`` that is no episode has no meaning.
         exists = self.program.within(gs)
         records = {n: r._replace(seq=jnp.where(exists, r.seq, -1)) for n, r in records.items()}
         return select(exists, end, gs.replace(step=end.step)), records
@@ -259,14 +260,15 @@ class CompiledGraph:
         """Run a row up to the supervisor's step.
 
         Args:
-            inside: Promise that the row is not past the end of the timeline, because episodes end earlier, and that
-                the timeline has the episode. It saves masking every update.
+                    inside: Whether the caller guarantees that the timeline has this episode and this row. It saves
+                        masking
+        every update.
 
         Returns:
-            The graph's state; the supervisor's step state; and whether the supervisor makes a step in this row.
+                    The graph's state; the supervisor's step state; and whether the supervisor makes a step in this row.
 
         Raises:
-            UsageError: The supervisor makes several steps in one row.
+                    UsageError: The supervisor makes several steps in one row.
         """
         self._check_row_start(gs, "observe")
         turn = self._only_slot()
@@ -356,8 +358,9 @@ class CompiledGraph:
     def _play_on(self, gs: GraphState, turn: Number, arrived: Number, hops: int) -> tuple[GraphState, Number]:
         """Run from turn to turn until the supervisor makes a step; return the state and the turn.
 
-        The loop always runs ``hops`` turns, the most that any step needs. After the step, and after the last row, the
-        state is masked.
+                The loop always runs ``hops`` turns, the largest number between two steps. Once the step or the last row
+                is
+        reached, the state stays unchanged.
         """
         program, count = self.program, len(self._turns)
 
@@ -381,16 +384,16 @@ class CompiledGraph:
                 now = select(active, (after, jnp.int32(following), reached), now)
             return now, None
 
-        # One sweep more than the hops need, as the first may start at any turn.
+        # One row more than the hops need, as the first hop may start at any turn of its row.
         sweeps = hops if count == 1 else -(-hops // count) + (hops > 0)
         start = (gs, jnp.asarray(turn, jnp.int32), jnp.asarray(arrived))
         return jax.lax.scan(sweep, start, length=sweeps)[0][:2] if sweeps != 1 else sweep(start, None)[0][:2]
 
     def _awaited(self, gs: GraphState, call: str) -> Number:
-        """Return the number of the supervisor's step that the caller makes next."""
+        """Return the number of the supervisor's step that is due; raise a ``UsageError`` if none is."""
         if self.supervisor not in gs.seq:
             raise UsageError(
-                f"{call}() needs a state in which a step of the supervisor {self.supervisor!r} awaits",
+                f"{call}() needs a state in which a step of the supervisor {self.supervisor!r} is due",
                 hint="call observe() first" if call == "advance" else "call reset() first",
             )
         self._check_episode(gs.eps)
@@ -411,7 +414,7 @@ class CompiledGraph:
         self._check_episode(gs.eps)
         if gs.seq:
             raise UsageError(
-                f"{call}() was called while a step of the supervisor {self.supervisor!r} awaits",
+                f"{call}() was called while a step of the supervisor {self.supervisor!r} is due",
                 hint="start from init(), or go on with advance() or step()",
             )
         if not _traced(gs.step) and (int(gs.step) >= self.rows or (call == "reset" and int(gs.step))):

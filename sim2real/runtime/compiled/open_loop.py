@@ -1,8 +1,9 @@
-"""A graph without a loop of computed messages, run node by node, with its timing as an argument.
+"""A graph whose computed nodes form no loop, run node by node, with its timing as an argument.
 
-Identification replays recorded commands to the world, and the world's outputs to the sensor. Such a graph needs no rows
-and no rings of outputs (``sim2real.runtime.compiled.graph``): each node makes all of its steps, then its readers
-make their steps and look messages up by ``seq``. The program depends only on the number of steps: it serves every log.
+Identification feeds recorded commands to the world, and the world's outputs to the sensor. Such a graph needs no rows
+and no rings of outputs (``sim2real.runtime.compiled.graph``): each node makes all of its steps, then its readers make
+theirs and look messages up by ``seq``. The program depends only on the number of steps, so one program serves logs of
+equal length.
 """
 
 import graphlib
@@ -24,8 +25,10 @@ from sim2real.runtime.steps import matched
 from sim2real.types import PyTree
 
 Tables = dict[str, PyTree]
-"""Node -> ``seq`` and ``ts`` of its steps, leaves ``(E, K)``, and for each of its ``inputs`` the window that a step
-reads: ``seq``, ``sent``, ``received``, ``lead``, leaves ``(E, K, W)``. Behind an episode's last step ``seq`` is -1."""
+"""Node -> ``seq`` and ``ts`` of its steps, leaves ``(E, K)``, and ``inputs``: input name -> ``seq``, ``sent``,
+``received`` and ``lead`` of the messages in each step's window, leaves ``(E, K, W)``. After an episode's last step
+``seq`` is -1.
+"""
 Step = Callable[[StepState], tuple[StepState, PyTree]]
 
 
@@ -37,7 +40,7 @@ class OpenLoopGraph:
 
     Attributes:
         order: The computed nodes, senders before readers.
-        world: The fastest of them that is a world; None without a world.
+        world: The fastest world among the computed nodes; None without a world.
 
     Raises:
         UsageError: Computed nodes form a loop.
@@ -55,7 +58,7 @@ class OpenLoopGraph:
             self.order = tuple(graphlib.TopologicalSorter(senders).static_order())
         except graphlib.CycleError as error:
             raise UsageError(
-                f"nodes hear each other in a loop: {' -> '.join(error.args[1])}",
+                f"nodes read each other's messages in a loop: {' -> '.join(error.args[1])}",
                 hint="give the recorded outputs of one of them",
             ) from None
         worlds = [self.nodes[n] for n in self.order if isinstance(self.nodes[n], BaseWorld)]
@@ -107,7 +110,7 @@ class OpenLoopGraph:
         """Run an episode and return a node's outputs, leaves ``(K, ...)``.
 
         Args:
-            tables: Those of this episode: leaves ``(K, ...)``.
+            tables: The tables of this episode: leaves ``(K, ...)``.
             replayed: Node -> its recorded messages, leaves ``(N, ...)``.
             known: Outputs of nodes that were computed elsewhere: node -> leaves ``(1 + K, ...)``, the default first.
         """
@@ -121,7 +124,7 @@ class OpenLoopGraph:
         raise UsageError(f"no node {record!r} runs that could be recorded. Nodes: {', '.join(self.order)}")
 
     def drive(self, gs: GraphState, tables: Tables, replayed: Mapping[str, PyTree], step: Step) -> PyTree:
-        """Run the world's ticks with another function in place of its step, for physics outside of the program.
+        """Run the world's ticks with ``step`` in place of the world's own step, such as physics outside of JAX.
 
         Args:
             step: Maps the world's step state to the next one and to a result.

@@ -2,8 +2,8 @@
 
 The program is a loop over **rows**. A row is one boundary, at which steps of the nodes are computed in a fixed sequence
 of **slots**, followed by n world ticks. The world ticks on a fixed grid and always runs. A step may be computed at any
-time after the last tick that it depends on and before the first tick that depends on its output, so there is usually a
-boundary in between, also if boundaries are several ticks apart.
+time after the last tick that it depends on and before the first tick that depends on its output. These two are usually
+far enough apart that a boundary lies between them, even if boundaries are several ticks apart.
 
 Each slot belongs to one node. The steps of every row must fit into the sequence such that each step comes after the
 steps whose messages it consumes, and after its node's previous step. The sequence should be short, because every row
@@ -28,7 +28,7 @@ from sim2real.graph.windows import newest_message
 MOST_STEPS = 256
 """Largest number of steps of one node in a row."""
 _UNREAD = np.int64(2**40)
-"""Tick at which an output without a reader is needed: later than any."""
+"""Tick at which an output without a reader is needed: after all others."""
 
 Steps = dict[str, np.ndarray]
 """Node name -> an int64 for each of its steps, shape ``(E, N)``."""
@@ -102,7 +102,7 @@ class Placer:
             yield key[0], self.edges[key], self.newest[key]
 
     def _cheapest(self, world_ticks: int) -> Placement:
-        """Return the placement with the fewest slots for the supervisor; among those, the fewest slots per tick.
+        """Return the placement with the fewest slots of the supervisor, then the fewest slots per tick.
 
         Training row by row needs a supervisor with one slot. The longest row is not always the best: three steps in ten
         ticks need two slots in rows of four ticks, and one in rows of three.
@@ -113,7 +113,7 @@ class Placer:
         highest = self._latest(lowest, 2 * longest)
         placements = []
         for n in range(longest, 0, -1):
-            # Every slack interval must contain a boundary, a multiple of n.
+            # Each step needs a boundary, a multiple of n ticks, between its earliest and its latest tick.
             if n > 1 and not all((-(-lowest[o] // n) * n <= highest[o])[self.valid(o)].all() for o in self.others):
                 continue
             placements.append(self._fill(n, world_ticks // n, self._rows(lowest, highest, n)))
@@ -129,9 +129,9 @@ class Placer:
         return Placement(ticks, rows, row, slot, slots)
 
     def _earliest(self) -> Steps:
-        """Return the earliest boundary for each step, in ticks: the number of ticks that it depends on.
+        """Return the earliest boundary of each step [ticks]: the number of ticks on which it depends.
 
-        Through other nodes' messages as well as directly.
+        Ticks also act on a step through other nodes.
         """
         earliest = {n: np.zeros_like(self.steps(n)) for n in self.others}
         changed = True
@@ -147,10 +147,10 @@ class Placer:
         return earliest
 
     def _latest(self, lowest: Steps, slack: int) -> Steps:
-        """Return the latest boundary for each step, in ticks: the first tick that depends on its output.
+        """Return the latest boundary of each step [ticks]: the first tick that depends on its output.
 
-        Through other nodes' messages as well as directly. Limited to ``slack`` ticks after the step's start: the
-        program must keep a step's inputs until it is computed, and some outputs reach the world late or never.
+        Steps also act on a tick through other nodes. At most ``slack`` ticks after the step's start: the program must
+        keep a step's inputs until the step is computed, and some outputs reach the world late or never.
         """
         # Start from the latest tick at which each step could run.
         ticks = self.timeline.vertices[self.world or ""].start
@@ -174,7 +174,7 @@ class Placer:
         return latest
 
     def _rows(self, lowest: Steps, highest: Steps, n: int) -> Steps:
-        """Return the row of each step, for rows of ``n`` ticks: early, but one step of a node a row where possible."""
+        """Return the row of each step, for rows of ``n`` ticks: early, and mostly one step of a node."""
         rows = {o: -(-lowest[o] // n) for o in self.others}
         # Raise rows until each step comes after the messages that it consumes.
         changed = True
@@ -193,7 +193,7 @@ class Placer:
         return rows
 
     def _rows_of_supervisor(self) -> Steps:
-        """Return the row of each step without a world: one row for each step of the supervisor, other steps early."""
+        """Return the row of each step in a graph without a world: each step of the supervisor has one row."""
         starts = self.timeline.vertices[self.supervisor].start
         rows = {n: search_rows(starts, np.ascontiguousarray(self.timeline.vertices[n].start)) for n in self.others}
         rows[self.supervisor] = self.steps(self.supervisor).copy()
@@ -210,7 +210,7 @@ class Placer:
 
 
 def _get_heard(of_sender: np.ndarray, newest: np.ndarray) -> np.ndarray:
-    """Look up a value of the sender's step that made the newest message of each reader's step; 0 without a message.
+    """Return for each step of the reader the sender's value at its newest message; 0 without a message.
 
     ``of_sender`` has a value for each step of the sender.
     """
@@ -244,8 +244,8 @@ def arrange(
 ) -> tuple[tuple[str, ...], Steps]:
     """Return the node of each slot, and the slot of each step.
 
-    The supervisor gets as many slots as it has steps in its fullest row, never more. The number of the other nodes'
-    slots is kept small by a greedy search.
+    The supervisor gets as many slots as it has steps in its fullest row. A greedy search keeps the number of the other
+    nodes' slots small.
 
     Args:
         row: Row of each step. Ties are decided by the order of the nodes in this dictionary.
@@ -342,8 +342,8 @@ def _merge(patterns: _Patterns, names: list[str], supervisor: int) -> tuple[list
             ready[:, i] = (left[:, i] > 0) & (placed >= need).all(axis=1)
 
         # Prefer a node whose step is ready in all the patterns that have the most steps of it left: such a slot is
-        # needed in any case. Otherwise add an extra slot for the node whose step is ready in most patterns. It never
-        # goes to the supervisor: a step of it that is not ready waits for another node's step, which comes first.
+        # needed in any case. Otherwise add a slot for the node whose step is ready in most patterns, never for the
+        # # supervisor: its step waits for the step of another node, which then is ready.
         fullest = (left == left.max(axis=0)) & (left > 0)
         shortens = ready.any(axis=0) & ~(fullest & ~ready).any(axis=0)
         if shortens.any():

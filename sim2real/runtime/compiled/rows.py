@@ -37,10 +37,11 @@ class Rollout(NamedTuple):
 
 
 class RowProgram:
-    """Traces rows; its tables, constants or those of ``with_data``, are looked up at the state's ``eps`` and ``step``.
+    """Traces rows, whose tables are looked up at the state's ``eps`` and ``step``.
 
     Args:
-        reusable: Whether each slot is masked, also if it makes a step in all rows of these timelines.
+        reusable: Whether other timelines may follow: then even a slot with a step in every row of these timelines is
+            masked.
     """
 
     def __init__(
@@ -52,8 +53,8 @@ class RowProgram:
     ) -> None:
         self.nodes, self.wiring, self.episodes = nodes, wiring, episodes
         self.bounds: DelayBounds = bounds_of(nodes)
-        # Shape (R, E, ...): the entries of one row, which all copies look up at once, are adjacent in memory.
-        # On the device without a compilation, which `jnp.asarray` makes for each shape.
+        # Shape (R, E, ...): the entries of one row, which all copies look up at once, are adjacent in memory.         #
+        # `device_put`, because `jnp.asarray` would compile a program for each shape.
         by_row = lambda t: jax.device_put(t.swapaxes(0, 1))  # noqa: E731
         self._tables = jax.tree_util.tree_map(by_row, [_pytree(t) for t in wiring.tables])
         self._world = jax.tree_util.tree_map(by_row, _pytree(wiring.world_table))
@@ -82,11 +83,12 @@ class RowProgram:
         outputs: dict[str, list[Rollout]],
         inside: bool = False,
     ) -> GraphState:
-        """Run some slots of the row; outside of the timelines nothing changes.
+        """Run the slots from ``begin`` to ``end`` of the row; outside of the timelines nothing changes.
 
         Args:
-            outputs: Node -> its steps; those of these slots are appended.
-            inside: Promise that the timelines have this row and episode, which saves masking every update.
+            outputs: Node -> its steps; the steps of these slots are appended.
+                        inside: Whether the caller guarantees that the timelines have this row and episode, which saves
+                            masking.
         """
         for i in range(begin, end):
             name = self.wiring.slots[i]
@@ -135,7 +137,7 @@ class RowProgram:
         """Return the step state of a slot's step; ``seq`` is -1 if the slot makes no step.
 
         Args:
-            inside: Promise that the timelines have this row and episode; ``seq`` is -1 elsewhere too.
+                        inside: Whether the caller guarantees that the timelines have this row and episode.
         """
         table = _at(self._tables[slot], gs)
         if not inside:
@@ -147,7 +149,7 @@ class RowProgram:
         return jnp.where(self.within(gs), self._tables[slot]["seq"][gs.step, gs.eps], -1)
 
     def within(self, gs: GraphState) -> Number:
-        """Return whether the timelines have the state's episode and row; XLA clamps an index that they lack."""
+        """Return whether the timelines have the state's episode and row; XLA would clamp an index beyond them."""
         return (gs.step < self.wiring.rows) & (gs.eps >= 0) & (gs.eps < self.episodes)
 
     def commit(self, gs: GraphState, name: str, new: StepState, output: PyTree, ran: Number | None) -> GraphState:
@@ -199,7 +201,7 @@ class RowProgram:
 
 
 def _window(ring: tuple[T, ...], age: jax.Array, width: int) -> T:
-    """Return a window of ``width`` of a node's last outputs, oldest first, without the ``age`` newest ones.
+    """Return ``width`` successive outputs of a node, oldest first, after leaving out the ``age`` newest ones.
 
     The outputs are separate arrays, chosen by selects, which XLA fuses with other elementwise operations. One stacked
     array would cost a GPU a concatenation, a copy and a gather per leaf.
@@ -233,7 +235,7 @@ def scan_rows(
         return state, {n: jax.tree_util.tree_map(lambda *x: jnp.stack(x), *r) for n, r in recorded.items() if r}
 
     gs, records = jax.lax.scan(body, gs, length=rows, unroll=unroll)
-    # (rows, per row, ...) -> (C, ...); counted, as -1 cannot be inferred for a leaf of size 0
+    # (rows, per row, ...) -> (C, ...); not by reshape(-1), which fails for a leaf of size 0
     merge = lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:])  # noqa: E731
     return gs, {n: jax.tree_util.tree_map(merge, r) for n, r in records.items()}
 

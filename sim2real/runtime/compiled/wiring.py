@@ -62,8 +62,8 @@ class Wiring:
         world: Name of the world that ticks in every row; None without a world.
         ticks: Number of world ticks in a row.
         slots: Node of each slot, in the order in which slots run.
-        tables: One for each slot.
-        world_table: The world's; arrays ``(E, R, ticks, ...)``.
+        tables: A table for each slot.
+        world_table: The world's table; arrays ``(E, R, ticks, ...)``.
         rings: Node -> number of its last outputs that the program carries.
         discarded: Fraction of the slots, over all rows, that compute no step.
         bursts: (node, input) -> the most messages that one step after the first consumes.
@@ -90,8 +90,8 @@ def wire(
 
     Args:
         supervisor: The supervisor's name; a row is at most as long as its period.
-        reusable: Whether rings are longer than these timelines need, so that most timelines of a robot have rings of
-            the same lengths.
+                reusable: Whether to round the lengths of rings up, so that most timelines of a robot give the same
+                    lengths.
     """
     if supervisor not in timeline.vertices:
         raise UsageError(f"the supervisor {supervisor!r} is not in the timeline. Nodes: {', '.join(timeline.vertices)}")
@@ -125,7 +125,7 @@ class _Tables:
         self.placer, self.placement, self.reusable = placer, placement, reusable
         self.timeline, self.nodes, self.world = placer.timeline, placer.nodes, placer.world
         self.rows, self.ticks = placement.rows, placement.ticks
-        # When the program computes each step, as a number that increases with row and slot.
+        # When the program computes each step: a number that increases with row and slot.
         self.done = {
             n: np.where(placer.valid(n), self._moment(placement.row[n], placement.slot[n]), NEVER)
             for n in placer.others
@@ -177,7 +177,7 @@ class _Tables:
     def _table(self, name: str, seq: np.ndarray, moment: np.ndarray, ticks: np.ndarray) -> SlotTable:
         """Return the table of steps ``seq (E, C)``.
 
-        ``moment (C,)`` is the time at which the program computes each, ``ticks (C,)`` the world's number of ticks then.
+        ``moment (C,)``: when the program computes each step; ``ticks (C,)``: the world's number of ticks until then.
         """
         ts = np.where(seq >= 0, np.take_along_axis(self.timeline.vertices[name].start, seq.clip(0), 1), 0)
         # Number of the sender's outputs before each step.
@@ -225,7 +225,8 @@ class _Tables:
                 connection = self.nodes[reader].inputs[input_name]
                 sender = connection.output_node.name
                 room = int(t.age.max(initial=0))
-                # 2, 4, 8 ...; a recording with a late step reads older messages than another recording of the robot.
+                # Round up to 2, 4, 8, ...: one late step makes a recording read older messages than other recordings
+                # do.
                 if self.reusable and (room or not connection.blocking):
                     room = max(2, 1 << (room - 1).bit_length())
                 rings[sender] = max(rings[sender], room + connection.total_window)
@@ -300,7 +301,7 @@ def check_fit(nodes: Mapping[str, BaseNode], timeline: Timeline, replayed: Mappi
         if (unsent & (edge.seq_in >= 0)).any():
             raise UsageError(
                 f"input {input_name!r} of node {name!r} consumes messages of steps that {edge.sender!r} does not make",
-                hint="an episode that ends earlier has other edges too: sim2real.graph.rules.consumer",
+                hint="if you shortened the timeline, compute its edges again: sim2real.graph.rules.consumer",
             )
 
 
