@@ -55,11 +55,11 @@ class ArtifactTable:
 
 
 def words_and_unit(name: str) -> tuple[str, str]:
-    """Split a quantity's name into words and unit: ``angle_rms_rad`` into "angle rms" and "rad"; unit "1" for none."""
+    """Split a quantity's name into words and unit: ``angle_rms_rad`` into "angle rms" and "rad"; "" for none."""
     for suffix, unit in _UNITS.items():
         if name.endswith(suffix):
             return name.removesuffix(suffix).replace("_", " "), unit
-    return name.replace("_", " "), "1"
+    return name.replace("_", " "), ""
 
 
 class Shown(ABC):

@@ -43,11 +43,11 @@ def robot_environment(
         UsageError: When there is no such pipeline, run or parameter.
         Sim2RealError: When there is no identification, or not of this robot.
     """
+    from sim2real.artifacts.identification import Identification
     from sim2real.artifacts.run import STAGES, attempts
     from sim2real.interop.robot import RobotEnvironment
     from sim2real.robots.robot import Robot
     from sim2real.stages.load import available, defaults_of, load_robot, moving
-    from sim2real.stages.shared.arguments import open_identification
     from sim2real.stages.shared.find_run import find_run
     from sim2real.stages.train.bundle import contract_of
     from sim2real.stages.train.setup import prepare
@@ -64,7 +64,7 @@ def robot_environment(
         robot = moving(load_robot(name))
     config = replace(config or defaults_of(robot).train, model=model)
     path, _ = find_parameters(robot, config, Path(runs), run)
-    identification = None if path is None else open_identification(path, robot)
+    identification = None if path is None else Identification.load(path)
     setup = prepare(robot, config, identification, changed=values)
     return RobotEnvironment(setup.env, contract_of(setup.robot, setup.env.task, setup.values))
 

@@ -1,4 +1,9 @@
-"""The messages between the nodes of a robot."""
+"""The messages between the nodes of a robot, and their fields as columns."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
 
 from sim2real import pytree
 from sim2real.graph.base import Base
@@ -57,3 +62,21 @@ class EpisodeStart(Base):
     velocity: Array
     aim: Array
     command: Array | None = None
+
+
+States = tuple[np.ndarray, dict[str, np.ndarray]]
+"""Times ``(N,)`` [s], and columns: states ``(N,)``, and the commands, one a step."""
+
+
+def as_columns(fields: Mapping[str, PyTree]) -> dict[str, np.ndarray]:
+    """Return the fields ``(N, ...)`` as columns ``(N,)``: a vector's entries become ``name[i]``."""
+    columns = {}
+    for name, values in fields.items():
+        flat = np.asarray(values).reshape(len(values), -1)
+        columns |= {name if flat.shape[1] == 1 else f"{name}[{i}]": column for i, column in enumerate(flat.T)}
+    return columns
+
+
+def as_sent(field: str, decided: Mapping[str, Any], commanded: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Return the columns of the agent's message, with the command as it was sent to the motors in a field."""
+    return as_columns({**decided, "command": commanded[field]})

@@ -26,15 +26,17 @@ from sim2real.later import jax
 from sim2real.policy.contract import ActionTerm, ObservationTerm, observation_size
 from sim2real.robots.agent import PolicyAgent
 from sim2real.robots.loop import WORLD, Draw
-from sim2real.robots.messages import EpisodeStart
+from sim2real.robots.messages import EpisodeStart, States
 from sim2real.robots.probe import Probe
 from sim2real.robots.training import IdentifiableLoop
 from sim2real.training.environment.tasks import Rewards
 from sim2real.types import Array, Key, PyTree, Scalar
 
 if TYPE_CHECKING:
+    from sim2real.artifacts.bundle import Bundle
     from sim2real.artifacts.identification import Noise
     from sim2real.emulation.robot import Emulation, VirtualTime
+    from sim2real.graph.delays import DelayDistribution
     from sim2real.hardware.device import Device, Following, Reading
     from sim2real.hardware.joint import Joint
     from sim2real.hardware.safety.gate import GateConfig, GateLimits
@@ -263,7 +265,8 @@ class RobotModel(ABC):
         """Return the world's node; ``resumed``: episodes begin in the middle of a recording.
 
         A world with a ``lead_s`` adds that time to the actuator's delay [s]. Its ``true_state`` returns the part of a
-        state that a value function may observe in simulation; without one, it is all of it.
+        state that a value function may observe in simulation; without one, it is all of it. Its ``solve_to_rest`` is
+        called for a simulation beside a deployment.
         """
 
     @abstractmethod
@@ -330,6 +333,32 @@ class Robot(RecordedRobot):
 
     def exported(self, values: Mapping[str, Scalar]) -> Exported | None:
         return self.model.exported(values)
+
+    def simulated(
+        self,
+        bundle: Bundle,
+        parameters: Sequence[Mapping[str, float]],
+        computation: Mapping[str, DelayDistribution],
+        rest: Sequence[np.ndarray],
+        duration_s: float,
+        node: str,
+    ) -> list[tuple[States, States]]:
+        """Return simulations of a policy from where the robot rested; default: in the compiled graph.
+
+        Args:
+            parameters: Parameters and delays of each simulation; simulation e does trial ``e % len(rest)``.
+            computation: Node -> distribution of its computation time.
+            rest: The measured positions ``(channels,)`` at the start of each trial.
+            node: The world, or the sensor.
+
+        Returns:
+            For each simulation the states of the node, and those of the sensor.
+        """
+        from sim2real.robots.training import simulate
+        from sim2real.training.networks.policy import Policy
+
+        policy = Policy.from_weights(bundle.weights, bundle.spec)
+        return simulate(self, policy, parameters, computation, rest, duration_s, node)
 
 
 PARTS: Mapping[str, type] = {
@@ -436,17 +465,3 @@ def joint_columns(channels: Sequence[Channel]) -> Mapping[str, Mapping[str, str]
         index = "" if c.index is None else f"[{c.index}]"
         rows[c.name] = {"position": position_of(c)} | ({"velocity": f"{c.velocity}{index}"} if c.velocity else {})
     return rows
-
-
-def as_columns(fields: Mapping[str, PyTree]) -> dict[str, np.ndarray]:
-    """Return the fields ``(N, ...)`` as columns ``(N,)``: a vector's entries become ``name[i]``."""
-    columns = {}
-    for name, values in fields.items():
-        flat = np.asarray(values).reshape(len(values), -1)
-        columns |= {name if flat.shape[1] == 1 else f"{name}[{i}]": column for i, column in enumerate(flat.T)}
-    return columns
-
-
-def as_sent(robot: Robot, decided: Mapping[str, Any], commanded: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return the columns of the agent's message, with the command as it was sent to the motors."""
-    return as_columns({**decided, "command": commanded[robot.drive.command]})

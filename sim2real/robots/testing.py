@@ -24,8 +24,9 @@ from sim2real.hardware.safety.gate import GateLimits
 from sim2real.identification.model import IdentifiableModel
 from sim2real.policy.contract import observation_size
 from sim2real.robots.loop import ACTUATOR, AGENT, SENSOR, WORLD
+from sim2real.robots.messages import as_columns, as_sent
 from sim2real.robots.nodes import connected
-from sim2real.robots.robot import RecordedRobot, Robot, as_columns, as_sent, checked
+from sim2real.robots.robot import RecordedRobot, Robot, checked
 from sim2real.robots.training import simulation_params, training_loop
 from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.training.environment.tasks import TrainingTask, terms_of
@@ -112,7 +113,7 @@ def check_simulation(robot: Robot) -> None:
     command, actions = outputs[ACTUATOR][robot.drive.command], len(robot.task.action)
     width = command.reshape(len(command), -1).shape[1]
     _hold(width == actions, f"a command has {width} entries, and there are {actions} actions")
-    _check_score(robot, measured, as_sent(robot, outputs[AGENT], outputs[ACTUATOR]))
+    _check_score(robot, measured, as_sent(robot.drive.command, outputs[AGENT], outputs[ACTUATOR]))
 
 
 def check_embedded(robot: Robot, folder: Path, limits: GateLimits) -> None:

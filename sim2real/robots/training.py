@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Unpack
 
@@ -13,7 +13,7 @@ from sim2real import pytree
 from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.delays import DelayDistribution
 from sim2real.graph.episode import named_leaves
-from sim2real.graph.node import BaseNode, NodeOptions
+from sim2real.graph.node import TICKS_PER_S, BaseNode, NodeOptions
 from sim2real.identification.parameters import ParameterTable
 from sim2real.later import jax, jnp
 from sim2real.policy.contract import observation_size
@@ -32,7 +32,7 @@ from sim2real.robots.loop import (
     split_delay,
     split_drawn_delay,
 )
-from sim2real.robots.messages import EpisodeStart
+from sim2real.robots.messages import EpisodeStart, States, as_columns, as_sent
 from sim2real.robots.nodes import SimActuator, SimSensor
 from sim2real.training.environment.tasks import Rewards, TrainingTask
 from sim2real.types import Array, PyTree, Scalar
@@ -122,6 +122,61 @@ def simulation_params(
         # Not `moved`, which keeps drawn starts within the bounds of goals: a robot may rest beyond them, on a stop.
         start = start.replace(position=start.position + offset)
     return node_parameters(robot, values, start, policy)
+
+
+def simulate(
+    robot: Robot,
+    policy: PyTree,
+    parameters: Sequence[Mapping[str, float]],
+    computation: Mapping[str, DelayDistribution],
+    rest: Sequence[np.ndarray],
+    duration_s: float,
+    node: str,
+) -> list[tuple[States, States]]:
+    """Return simulations of a policy in one compiled graph; see ``Robot.simulated``."""
+    from sim2real.graph.schedule import draw
+    from sim2real.graph.windows import make_room
+    from sim2real.runtime.compiled.graph import CompiledGraph
+
+    # Draw the timelines.
+    nodes, _ = training_loop(robot, parameters[0], {}, computation, True)
+    if (solve_to_rest := getattr(nodes[WORLD], "solve_to_rest", None)) is not None:
+        solve_to_rest()
+    count = len(parameters)
+    timeline = draw(nodes, duration_s, count, 0)
+    make_room(nodes, timeline)
+    graph = CompiledGraph(nodes, AGENT, timeline)
+
+    # Each simulation does the trial of its episode, from where the robot rested: friction holds it beside the task's
+    # start, and a swing-up from there may go to the other side.
+    episodes = [(e % len(rest), rest[e % len(rest)]) for e in range(count)]
+    trials = [simulation_params(robot, v, policy, *e) for v, e in zip(parameters, episodes, strict=True)]
+    params = jax.tree_util.tree_map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *trials)
+    recorded = tuple({node, SENSOR, AGENT, ACTUATOR})
+
+    def rollout(eps: jax.Array, params: PyTree) -> PyTree:
+        return graph.rollout(graph.init(jax.random.key(0), params, eps=eps), record=recorded)[1]
+
+    records = jax.tree_util.tree_map(np.asarray, jax.jit(jax.vmap(rollout))(np.arange(count), params))
+
+    # Read the states that a node sends, and the commands.
+    def steps(name: str, e: int) -> np.ndarray:
+        return records[name].seq[e][records[name].seq[e] >= 0]
+
+    def sent(name: str, e: int) -> dict[str, np.ndarray]:
+        ran = records[name].seq[e] >= 0
+        return {n: np.asarray(leaf)[e][ran] for n, leaf in named_leaves(records[name].output).items()}
+
+    def states(e: int, node: str) -> States:
+        vertices = timeline.vertices
+        command_s = vertices[ACTUATOR].end[e][steps(ACTUATOR, e)] / TICKS_PER_S
+        columns = {**as_sent(robot.drive.command, sent(AGENT, e), sent(ACTUATOR, e)), **as_columns(sent(node, e))}
+        # The message of a tick of the world is the state at its end.
+        own, rate = steps(node, e), graph.nodes[node].rate
+        t_s = (own + 1) / rate if node == WORLD else vertices[node].start[e][own] / TICKS_PER_S
+        return t_s, {**columns, "t_command": command_s}
+
+    return [(states(e, node), states(e, SENSOR)) for e in range(count)]
 
 
 class LoopTask(TrainingTask):

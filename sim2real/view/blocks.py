@@ -238,7 +238,7 @@ def interval(low: float | None, high: float | None, digits: int = 4) -> str:
 
 def pretty_unit(unit: str) -> str:
     """Return a unit or a formula with powers as superscripts."""
-    return unit.replace("^2", "²").replace("^3", "³") or "1"
+    return unit.replace("^2", "²").replace("^3", "³")
 
 
 def flat(tree: object, prefix: str = "") -> Iterable[tuple[str, str]]:

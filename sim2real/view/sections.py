@@ -345,7 +345,7 @@ def _scores(episode: EpisodeRow) -> str:
     both = [
         f"{label}: robot {number(value, 3)}"
         + (f", simulation {number(episode.simulation[n], 3)}" if n in episode.simulation else "")
-        + ("" if unit == "1" else f" {unit}")
+        + (f" {unit}" if unit else "")
         for n, value in episode.real.items()
         for label, unit in [words_and_unit(n)]
     ]

@@ -1,5 +1,8 @@
 """What a deployment's states are called, for scores and for pages."""
 
+from pathlib import Path
+from typing import Any, cast
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +13,7 @@ from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.timing import Timing
 from sim2real.graph.base import Base
 from sim2real.graph.episode import Episode, Steps
+from sim2real.robots.training import simulate
 from sim2real.stages.deploy import simulation
 from sim2real.stages.load import load_robot
 
@@ -53,12 +57,13 @@ def test_the_arms_score_reads_them(states):
     assert set(ARM.task.score(t_s, found)) == {"success", "reached", "distance_m", "first_reached_s"}
 
 
-def test_a_deployment_on_a_machine_that_was_too_busy_is_reported_without_a_simulation(capsys):
+def test_a_deployment_on_a_machine_that_was_too_busy_is_reported_without_a_simulation(capsys, monkeypatch):
     slow = steps(50)
     busy = Steps(**{**vars(slow), "end": slow.start + 100_000})
     episode = Episode(steps={"agent": busy}, messages={}, outputs={})
-    rest = [np.zeros(1)]
-    assert simulation.simulate(ARM, None, [{"gain": 1.0}], Timing.of(episode), 1.0, rest, "world") == []
+    monkeypatch.setattr(simulation, "plausible_parameters", lambda identification, episodes: [{"gain": 1.0}])
+    logs, anything = [Recording(Path("session.mcap"), episode)], cast(Any, None)
+    assert simulation._simulated(ARM, logs, anything, cast(Any, "an identification"), 1.0, "world") == []
     assert (
         "warning: nothing to compare with: only 0 of 50 steps of node 'agent' took less than" in capsys.readouterr().err
     )
@@ -81,8 +86,8 @@ def test_simulated_measurements_are_compared_with_measurements():
     episode = Episode(steps={n: steps(30) for n in ("sensor", "agent", "actuator")}, messages={}, outputs={})
     policy = Push(jnp.full(1, 1.5))
     # The robot rested beside the start of its task, a turn away.
-    rest, timing = [np.array([3 * np.pi + 0.06])], Timing.of(episode)
-    (t_s, world), (at_s, sensor) = simulation.simulate(robot, policy, [values], timing, 0.6, rest, "world")[0]
+    rest, (computation, _) = [np.array([3 * np.pi + 0.06])], Timing.of(episode).computation()
+    (t_s, world), (at_s, sensor) = simulate(robot, policy, [values], computation, rest, 0.6, "world")[0]
     assert float(sensor["th"][0]) == pytest.approx(np.pi + 0.06, abs=1e-4)
     assert set(sensor) == set(world) == {"th", "thdot", "command", "t_command"}
     assert len(sensor["th"]) == len(at_s) < len(t_s)

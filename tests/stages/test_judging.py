@@ -85,6 +85,13 @@ def test_a_verdict_names_what_else_was_found():
     assert findings(success=0.5) == [Finding.SUCCESS, Finding.HOLDS]
 
 
+def test_of_several_joints_the_worst_is_named_first():
+    (row,) = deployed(identified=0.02).replay
+    several = [replace(row, joint=name, error=error) for name, error in (("pan", 0.02), ("lift", 0.05), ("roll", None))]
+    reasons = decide(replace(deployed(), replay=tuple(several))).reasons
+    assert [r.about for r in reasons if r.finding is Finding.WRONG] == ["roll", "lift", "pan"]
+
+
 @pytest.mark.parametrize(
     ("paused_s", "success", "status"), [(0.4, 0.7, "not judged"), (0.4, 1.0, "fine"), (0.05, 0.7, "re-train")]
 )
@@ -195,11 +202,15 @@ def replace_terms(terms):
     return SimpleNamespace(logs=IDENTIFIED.logs, used_terms=terms, internal=IDENTIFIED.internal)
 
 
-def test_a_deployment_without_an_identification_says_so(folder):
+@pytest.mark.parametrize("recorded", [True, False])
+def test_a_deployment_without_an_identification_says_so(folder, recorded, monkeypatch):
+    """A run that another run's bundle was deployed into has no recording to identify from."""
+    monkeypatch.setattr(verdict, "finished", lambda run, stage: "a recording" if recorded else None)
     pipeline, found = load_robot("pendulum"), deployed()
     alone = replace(found, episodes=tuple(replace(e, simulation={}) for e in found.episodes))
     told = verdict.judge(alone, pipeline, None, folder).verdict
-    assert (told.status, told.next) == ("not judged", "sim2real identify pendulum --run runs/pendulum/T")
+    first = "" if recorded else "sim2real record pendulum --run runs/pendulum/T && "
+    assert (told.status, told.next) == ("not judged", f"{first}sim2real identify pendulum --run runs/pendulum/T")
     # A robot that is simulated in plain MuJoCo needs none.
     assert verdict.judge(found, pipeline, None, folder).verdict.status == "fine"
 

@@ -19,7 +19,7 @@ from sim2real.stages.identify import fitting
 from sim2real.stages.identify import stage as identify_stage
 from sim2real.stages.identify.progress import Best, kept
 from sim2real.stages.load import load_robot
-from sim2real.stages.shared.arguments import open_identification
+from sim2real.stages.shared.arguments import in_world_of
 
 ROOT = Path(__file__).parents[2]
 LOG = ROOT / "datasets" / "pendulum" / "chirp.mcap"
@@ -61,7 +61,7 @@ def test_the_best_so_far_is_left_and_says_what_it_is(pendulum, tmp_path, monkeyp
     assert rows["gain"]["estimate"] == pytest.approx(21.0, rel=1e-4)
     assert rows["gain"]["state"] == "not determined"
     with pytest.raises(Sim2RealError, match="did not finish"):
-        open_identification(path, pendulum)
+        in_world_of(Identification.load(path), pendulum)
 
 
 def test_nothing_is_left_where_nothing_was_found_or_something_else_went_wrong(pendulum, tmp_path, monkeypatch):

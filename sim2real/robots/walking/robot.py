@@ -4,21 +4,27 @@ from __future__ import annotations
 
 import copy
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import jax
+import numpy as np
 
 from sim2real.emulation.body import Terrain
 from sim2real.robots.loop import DELAYS
+from sim2real.robots.messages import States
 from sim2real.robots.robot import Robot
 from sim2real.robots.walking.drive import LegMotors, WalkingDrive
 from sim2real.robots.walking.stand import LegsInAStand
 from sim2real.robots.walking.task import Commands, Moment, Term, WalkingTask
 from sim2real.robots.walking.world import WalkingModel
+
+if TYPE_CHECKING:
+    from sim2real.artifacts.bundle import Bundle
+    from sim2real.graph.delays import DelayDistribution
 
 
 class ComposedRobot(Robot):
@@ -85,3 +91,20 @@ class ComposedRobot(Robot):
 
     def identifiable(self, max_delay_s: float) -> LegsInAStand:
         return LegsInAStand(self, max_delay_s)
+
+    def simulated(
+        self,
+        bundle: Bundle,
+        parameters: Sequence[Mapping[str, float]],
+        computation: Mapping[str, DelayDistribution],
+        rest: Sequence[np.ndarray],
+        duration_s: float,
+        node: str,
+    ) -> list[tuple[States, States]]:
+        """Return one episode of each trial in C MuJoCo: its graph takes over ten minutes to compile on a processor."""
+        del computation, node
+        from sim2real.robots.walking.twin import episode
+
+        runner, nominal = bundle.runner(), self.nominal()
+        played = [episode(self, runner, nominal | dict(parameters[i]), i, duration_s) for i in range(len(rest))]
+        return [(states, states) for states in played]

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -14,11 +14,13 @@ from sim2real.emulation.body import HiddenTwin, LeggedBody
 from sim2real.graph.base import GraphState, StepState
 from sim2real.policy.runner import Runner
 from sim2real.robots.loop import AGENT, DELAYS, SENSOR
+from sim2real.robots.messages import States
 from sim2real.robots.nodes import in_numpy
-from sim2real.robots.robot import Robot
 from sim2real.robots.walking.drive import BodyReading, gravity_of, into_base
-from sim2real.robots.walking.robot import ComposedRobot
 from sim2real.robots.walking.world import FRICTION, MOTOR_STRENGTH, PAYLOAD, STRENGTH
+
+if TYPE_CHECKING:
+    from sim2real.robots.walking.robot import ComposedRobot
 
 _mj: Any = mujoco
 STEP_S = 0.002
@@ -184,22 +186,6 @@ def walk(
 # -- beside a deployment
 
 
-def plain_episodes(
-    robot: Robot, policy: Runner, values: Mapping[str, float] | None, trials: Sequence[int], duration_s: float
-) -> list[tuple[np.ndarray, dict[str, np.ndarray]]] | None:
-    """Return episodes of a policy: times ``(N,)`` [s] and columns ``(N,)``; None for a robot that does not walk.
-
-    The graph of a walking robot takes more than ten minutes to compile on a processor, so C MuJoCo simulates it.
-
-    Args:
-        values: Parameters and delays by name; None: nominal ones.
-        trials: The trial of each episode.
-    """
-    if not isinstance(robot, ComposedRobot):
-        return None
-    return [_episode(robot, policy, {**robot.nominal(), **(values or {})}, n, duration_s) for n in trials]
-
-
 def twin_of(robot: ComposedRobot, values: Mapping[str, float], seed: int = 0) -> Twin:
     """Return the twin with parameters and delays by name; the policy's computation adds to the actuator's delay."""
     joints = robot.model.joints
@@ -217,10 +203,8 @@ def twin_of(robot: ComposedRobot, values: Mapping[str, float], seed: int = 0) ->
     return Twin(robot, hidden, seed)
 
 
-def _episode(
-    robot: ComposedRobot, policy: Runner, values: Mapping[str, float], trial: int, duration_s: float
-) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Return times ``(N,)`` [s] and columns ``(N,)`` of a trial, up to a fall."""
+def episode(robot: ComposedRobot, policy: Runner, values: Mapping[str, float], trial: int, duration_s: float) -> States:
+    """Return a trial up to a fall, with parameters and delays by name."""
     twin, drawn, times, rows = twin_of(robot, values, trial), robot.commands.of_trial(trial), [], []
 
     def commanded(t_s: float) -> np.ndarray:

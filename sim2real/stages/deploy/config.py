@@ -15,8 +15,9 @@ class DeployConfig:
 
     port: Annotated[str, Flag("PORT")] = "embedded"
     """Serial port of the servo bus, or 'embedded' for the emulated robot."""
-    bundle: Annotated[str | None, Flag("DIR")] = None
-    """Folder of the policy bundle; default: the newest training of the pipeline, or the bundle that it ships."""
+    bundle: Annotated[str | None, Flag("RUN|PIPELINE|BUNDLE")] = None
+    """Policy: a bundle's folder, a run, or a pipeline; default: the newest training, or the bundle that the pipeline
+    ships."""
     episodes: int = 2
     """Number of episodes."""
     duration_s: float = 10.0

@@ -12,19 +12,19 @@ from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.deployment import PROBE, Deployment, EpisodeRow, log_of
 from sim2real.artifacts.identification import ROUND_TRIP, Identification, compared_table
 from sim2real.artifacts.recording import TRUTH, Recording
-from sim2real.artifacts.run import StageFolder, finished, newest, open_stage
+from sim2real.artifacts.run import StageFolder, finished, open_stage
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.hardware.device import Following
 from sim2real.installation import has_jax
 from sim2real.policy.contract import PolicyContract
-from sim2real.robots.robot import GRAVITY, RecordedRobot, Robot, RobotTask, in_world, tilt_of
+from sim2real.robots.robot import GRAVITY, RecordedRobot, Robot, RobotTask, tilt_of
 from sim2real.stages.deploy.config import DeployConfig
 from sim2real.stages.deploy.episodes import run_episodes
 from sim2real.stages.load import AnyRobot, defaults_of, moving, robot_of, shipped_policy
 from sim2real.stages.session.episode import check_deadlines, show_sessions
 from sim2real.stages.shared import arguments
-from sim2real.stages.shared.arguments import check_parameters, open_identification
-from sim2real.stages.shared.find_run import warn_of_stale
+from sim2real.stages.shared.arguments import in_world_of
+from sim2real.stages.shared.find_run import find_bundle
 from sim2real.stages.terminal.console import artifact_table, note
 from sim2real.types import Json
 
@@ -63,7 +63,7 @@ def deploy(
     robot = _commanded(moving(robot), config)
     require_fit(robot, bundle, config)
     if identification is not None:
-        check_parameters(identification, robot)
+        robot = in_world_of(identification, robot)
     return _deployed(robot, bundle, folder, config, identification)
 
 
@@ -74,7 +74,11 @@ def _deployed(
     config: DeployConfig,
     identification: Identification | None,
 ) -> Deployment:
-    """Run the policy on the robot, and compare with the simulation; all arguments are checked."""
+    """Run the policy on the robot, and compare with the simulation; all arguments are checked.
+
+    Args:
+        robot: In the world of the identification.
+    """
     # Run the episodes on the robot.
     logs = [log_of(folder, i) for i in range(config.episodes)]
     following = None if identification is None else _following(robot, identification)
@@ -88,7 +92,6 @@ def _deployed(
     from sim2real.stages.deploy.simulation import compare
     from sim2real.stages.deploy.verdict import judge
 
-    robot = in_world(robot, None if identification is None else identification.internal.world)
     deployment = compare(robot, recordings, bundle, identification, config.duration_s)
     probe = Recording.load(folder / PROBE) if (folder / PROBE).is_file() else None
 
@@ -103,9 +106,13 @@ def run(robot: RecordedRobot, config: DeployConfig, root: Path, run_dir: Path | 
     Args:
         run_dir: Run folder to add to; None takes that of the bundle.
     """
-    # Check the bundle before a folder is made.
+    # Check the bundle before a folder is made. A policy that was trained here is deployed in its run.
     robot = _commanded(moving(robot), config)
-    path, run_dir = find_bundle(robot, config, root, run_dir)
+    path = find_bundle(config.bundle or robot.name, root, run_dir)
+    if path == shipped_policy(robot.folder):
+        note(f"pipeline {robot.name!r} has no training here: its shipped policy is deployed")
+    elif config.bundle is None:
+        run_dir = run_dir or path.parent.parent
     bundle = Bundle.load(path)
     require_fit(robot, bundle, config)
     with open_stage(root, robot.name, "deploy", config, {"bundle": path}, run_dir, config.dry_run) as stage:
@@ -115,7 +122,10 @@ def run(robot: RecordedRobot, config: DeployConfig, root: Path, run_dir: Path | 
         if config.port == "embedded":
             stage.output("truth", TRUTH)
         identified = finished(stage.run_dir, "identify")
-        identification = None if identified is None else open_identification(identified.output("parameters"), robot)
+        identification = None
+        if identified is not None:
+            identification = Identification.load(identified.output("parameters"))
+            robot = in_world_of(identification, robot)
         deployment = _deployed(robot, bundle, stage.folder, config, identification)
         show_sessions(deployment.recordings, robot)
         if config.dry_run:
@@ -176,26 +186,6 @@ def _summary_lines(deployment: Deployment) -> dict[str, Json]:
     counts = {name: last[name.replace(" ", "_")] for name in ("lost replies", "late replies", "command timeouts")}
     measured = {"measured delay": deployment.measured_delay} if deployment.measured_delay else {}
     return {**{name: round(v, 3) for name, v in scores.items() if v is not None}, **measured, **counts}
-
-
-def find_bundle(
-    robot: RecordedRobot, config: DeployConfig, root: Path, run_dir: Path | None
-) -> tuple[Path, Path | None]:
-    """Return the bundle's folder and the run folder to add to.
-
-    The bundle is that of the flag, of the newest training, or the one that the pipeline ships.
-    """
-    if config.bundle is not None:
-        return Path(config.bundle), run_dir
-    try:
-        training = newest(root, robot.name, "train", run_dir)
-    except Sim2RealError:
-        if (shipped := shipped_policy(robot.folder)) is None:
-            raise
-        note(f"pipeline {robot.name!r} has no training here: its shipped policy is deployed")
-        return shipped, run_dir
-    training = warn_of_stale(training)
-    return training.output("bundle"), run_dir or training.run_dir
 
 
 def require_fit(robot: Robot, bundle: Bundle, config: DeployConfig) -> None:

@@ -13,7 +13,7 @@ from sim2real.artifacts.bundle import GOOD_SUCCESS
 from sim2real.artifacts.deployment import Deployment, Drift, Finding, Reason, Status, Verdict, as_here
 from sim2real.artifacts.identification import ComparedError, Identification
 from sim2real.artifacts.paths import shown
-from sim2real.artifacts.run import MANIFEST
+from sim2real.artifacts.run import MANIFEST, finished
 from sim2real.errors import OtherMotion, Sim2RealError
 from sim2real.installation import has_jax
 from sim2real.robots.robot import RecordedRobot, watched
@@ -112,8 +112,9 @@ def _changed(d: Deployment) -> list[Reason]:
 
 
 def _wrong(d: Deployment) -> list[Reason]:
-    """Errors above the expected ones."""
-    wrong = [Reason(Finding.WRONG, r.joint) for r in d.replay if r.exceeded]
+    """Errors above the expected ones, the worst joint first."""
+    exceeded = sorted((r for r in d.replay if r.exceeded), key=_ratio, reverse=True)
+    wrong = [Reason(Finding.WRONG, r.joint) for r in exceeded]
     likely = [Reason(Finding.LIKELY, d.drift.likely.name)] if d.drift and d.drift.likely else []
     return [*wrong, *likely] if wrong else []
 
@@ -193,21 +194,24 @@ def next_command(
         folder: Folder of the deployment.
     """
     run = ["--run", shown(folder.parent)] if (folder / MANIFEST).is_file() else []
-    stages = verdict.stages
+    stages, default = verdict.stages, defaults_of(robot).identify
     if not stages:
         return ""
+    if identification is None and finished(folder.parent, "record") is None:
+        stages = ("record", *stages)
+    typed = {stage: shlex.join(["sim2real", stage, robot.name, *run]) for stage in stages}
     if identification is None:
-        return shlex.join(["sim2real", "identify", robot.name, *run])
-    then = [shlex.join(["sim2real", stage, robot.name, *run]) for stage in stages if stage in ("train", "deploy")]
+        return " && ".join(typed.values())
+    then = [typed[stage] for stage in stages if stage in ("train", "deploy")]
     if "identify" not in stages and "record" not in stages:
         return " && ".join(then)
-    usual = replace(defaults_of(robot).identify, terms=verdict.terms)
+    usual = replace(default, terms=verdict.terms)
     logs = logs_to_identify([r.path for r in deployment.logs], deployment.drift, identification, folder)
     # Without logs that suffice the robot is recorded first.
     if "record" in stages or not logs:
         record = shlex.join(["sim2real", "record", robot.name])
         identify = shlex.join(["sim2real", "identify", robot.name, "--terms", verdict.terms])
-        return record if verdict.terms == defaults_of(robot).identify.terms else f"{record} && {identify}"
+        return record if verdict.terms == default.terms else f"{record} && {identify}"
     return " && ".join([command(robot, replace(usual, log=logs), Path("runs"), shlex.join(run)), *then])
 
 

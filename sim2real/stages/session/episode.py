@@ -25,8 +25,9 @@ from sim2real.installation import has_jax
 from sim2real.later import jax
 from sim2real.log.writer import McapRecorder
 from sim2real.robots.loop import ACTUATOR, AGENT, ROLES, SENSOR
+from sim2real.robots.messages import as_columns
 from sim2real.robots.nodes import connected
-from sim2real.robots.robot import Robot, as_columns, joint_columns
+from sim2real.robots.robot import Robot, joint_columns
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import MonotonicClock, realtime
 from sim2real.runtime.failure import noted

@@ -26,6 +26,7 @@ from sim2real.stages.load import available, defaults_of, mapping_of
 from sim2real.stages.terminal.console import note
 
 T = TypeVar("T")
+Kind = TypeVar("Kind", bound=RecordedRobot)
 AnyPath: TypeAlias = str | Path
 AnyRecording: TypeAlias = Recording | AnyPath
 """A recording, its log, or the folder of a record stage."""
@@ -214,22 +215,12 @@ def require_units(recording: Recording, robot: RecordedRobot) -> None:
                 )
 
 
-def open_identification(path: Path, robot: RecordedRobot) -> Identification:
-    """Read what identify found for a robot.
+def in_world_of(identification: Identification, robot: Kind) -> Kind:
+    """Return a robot in the world of an identification, with which it can be simulated.
 
     Raises:
-        Sim2RealError: When it is missing, damaged, of another pipeline, was interrupted, or did not converge.
-    """
-    identification = Identification.load(path)
-    check_parameters(identification, robot)
-    return identification
-
-
-def check_parameters(identification: Identification, robot: RecordedRobot) -> None:
-    """Check that a robot can be simulated with an identification.
-
-    Raises:
-        UsageError: When the world that it was identified in is not installed.
+        UsageError: The world is not installed.
+        Sim2RealError: It is of another pipeline, was interrupted, did not converge, or lacks parameters.
     """
     hint = f"make them with `sim2real identify {robot.name}`"
     if identification.pipeline != robot.name:
@@ -242,3 +233,4 @@ def check_parameters(identification: Identification, robot: RecordedRobot) -> No
     there = {p.name for p in identification.parameters if p.standard_error is not None}
     if lacking := [n for n in expected if n not in there]:
         raise Sim2RealError(f"these parameters hold no finite estimate of {', '.join(lacking)}", hint=hint)
+    return robot

@@ -58,10 +58,13 @@ def find_parameters(source: str, runs: Path) -> Path:
     return path / PARAMETERS if (path / PARAMETERS).is_file() else _output(source, runs, "identify", "parameters")
 
 
-def find_bundle(source: str, runs: Path) -> Path:
+def find_bundle(source: str, runs: Path, run_dir: Path | None = None) -> Path:
     """Return the folder of the policy bundle that a text names: a bundle, a stage folder, a pipeline or a run.
 
     A pipeline without a training of its own gives the bundle that it ships.
+
+    Args:
+        run_dir: Run in which a pipeline's training is looked for; None: any.
     """
     from sim2real.artifacts.bundle import BUNDLE
     from sim2real.policy.bundle import CONTRACT
@@ -76,17 +79,18 @@ def find_bundle(source: str, runs: Path) -> Path:
             hint="a policy of another library becomes a bundle with sim2real.policy.bundle.save_bundle",
         )
     try:
-        return _output(source, runs, "train", "bundle")
+        return _output(source, runs, "train", "bundle", run_dir)
     except Sim2RealError:
         if source in available() and (shipped := shipped_policy(folder_of(source))) is not None:
             return shipped
         raise
 
 
-def _output(source: str, runs: Path, stage: str, name: str) -> Path:
+def _output(source: str, runs: Path, stage: str, name: str, run_dir: Path | None = None) -> Path:
     """Return an output of a stage: the newest of a pipeline, or of a run."""
-    run_dir = None if source in available() else find_run(runs, source)
-    pipeline = source if run_dir is None else pipeline_of(run_dir)
+    known = source in available()
+    run_dir = run_dir if known else find_run(runs, source)
+    pipeline = source if known or run_dir is None else pipeline_of(run_dir)
     return warn_of_stale(newest(runs, pipeline, stage, run_dir)).output(name)
 
 

@@ -20,7 +20,7 @@ from sim2real.robots.robot import RecordedRobot, Robot
 from sim2real.robots.training import LoopTask, training_loop
 from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.stages.load import defaults_of, moving
-from sim2real.stages.shared.arguments import check_parameters
+from sim2real.stages.shared.arguments import in_world_of
 from sim2real.stages.terminal.console import note
 from sim2real.stages.train.config import TrainConfig
 from sim2real.training.environment.draws import draw_robots, without_default_ranges
@@ -132,7 +132,7 @@ def check_identification(
         return None
     if identification is None:
         raise UsageError("training on the identified model needs an identification", hint="--model nominal needs none")
-    check_parameters(identification, robot)
+    in_world_of(identification, robot)
     verdict = identification.verdict
     if verdict.status != "accepted" and not config.force:
         reasons = "".join(f"\n  {reason}" for reason in verdict.reasons)

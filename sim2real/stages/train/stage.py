@@ -26,7 +26,6 @@ from sim2real.stages.shared.arguments import (
     AnyTiming,
     config_of,
     identification_of,
-    open_identification,
     recordings_of,
 )
 from sim2real.stages.shared.find_run import find_run, warn_of_stale
@@ -147,7 +146,7 @@ def run(robot: RecordedRobot, config: TrainConfig, root: Path, run_dir: Path | N
     resume = None
     if interrupted is not None:
         resume = interrupted.folder / CHECKPOINT
-    identification = None if path is None else check_identification(robot, config, open_identification(path, robot))
+    identification = None if path is None else check_identification(robot, config, Identification.load(path))
     if identification is not None:
         timing_of(identification)
         if identification.verdict.status != "accepted":
