@@ -53,16 +53,6 @@ def test_a_motor_that_lets_go_stops_the_robot_and_is_named(family, plant, fault,
     robot.stop()
 
 
-@pytest.mark.parametrize("family", [ANGLES, STS], ids=lambda family: family.name)
-@pytest.mark.parametrize("gate", [{}, {"following_rad": 0.1}], ids=["by the servos' figures", "by a limit"])
-def test_sound_joints_go_on(family, gate):
-    robot = family.robot("Joints", rate_per_gain=RATES[family.name])
-    with family.rig(robot, {**GATE, **gate}) as rig:
-        assert rig.following is not None
-        assert drive(rig, swing, 3.0) is None
-    robot.stop()
-
-
 def test_a_joint_at_rest_may_be_moved_off_its_goal_by_less_than_nearly_all_of_the_torque():
     robot = ANGLES.robot("Joints")
     with ANGLES.rig(robot) as rig:

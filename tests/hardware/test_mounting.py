@@ -1,5 +1,8 @@
 """Mountings of joints: whatever zero, direction and gear are between joint and motor, joints move and stop the same."""
 
+from types import SimpleNamespace
+from unittest.mock import Mock
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -8,12 +11,21 @@ from virtual_bus import IdleDevice
 
 from sim2real.emulation.plant import MountedPlant
 from sim2real.errors import SafetyStop, UsageError
-from sim2real.hardware.device import POSITION, VOLTAGE, CommandKind, Counters, OperatingMode, Reading, Transaction
+from sim2real.hardware.device import (
+    POSITION,
+    VOLTAGE,
+    CommandColumn,
+    CommandKind,
+    Counters,
+    OperatingMode,
+    Reading,
+    Transaction,
+)
 from sim2real.hardware.joint import Joint, Mounting
 from sim2real.hardware.safety.gate import GateConfig
 from sim2real.hardware.safety.rig import Rig
 
-STEP_S, N = 0.02, 2
+STEP_S, N, NEVER = 0.02, 2, Transaction(0, 0, 0, 0)
 PLAIN = ((0.0, 1, 1.0),) * N
 VELOCITY, TORQUE = CommandKind("velocities", "rad/s", "zero"), CommandKind("torques", "N m", "zero")
 DUTY = CommandKind("duties", "1", "zero")
@@ -64,7 +76,7 @@ class Bench(IdleDevice):
 
     def command(self, values):
         self.heard.append(np.array(values))
-        return Transaction(0, 0, 0, 0)
+        return NEVER
 
     def measure(self):
         told = self.to_joint(self.heard[-1]) if self.heard else np.zeros(N)
@@ -100,7 +112,8 @@ def timeline(device, rows, gate, wanted):
         try:
             for step, command in enumerate(wanted):
                 reading = rig.measure()
-                allowed = rig.command(command, 0.0, STEP_S * step)
+                stale_s = 99.0 if step % 9 == 5 else 0.0
+                allowed = rig.command(command, stale_s, STEP_S * step)
                 seen.append(np.concatenate([reading.position_rad, reading.velocity_rad_s, reading.load, allowed]))
         except SafetyStop as stop:
             stopped = str(stop)
@@ -126,25 +139,25 @@ def test_a_mounting_changes_nothing_that_is_seen_of_the_joints(kind, rows, seed)
     wanted = np.cumsum(random.normal(0.0, 0.25, (40, N)), axis=0)
     plain, why, counts = compare(kind, rows, wanted, gate_of(kind, max_speed_rad_s=(30.0, 30.0)))
     assert not why
-    assert counts.passed == 40
+    assert (counts.passed, counts.stale) == (40, 4)
     sent = plain[:, -N:]
     assert np.all((sent >= [-0.9, -1.4]) & (sent <= [1.1, 0.7]))
 
 
+@pytest.mark.parametrize(
+    ("wanted", "gate", "device", "words"),
+    [
+        ([1.1, 0.0], {"max_speed_rad_s": 0.5}, {}, "joint 'motor 0' is beyond the limit of 0.5 rad/s"),
+        ([0.0, 0.0], {}, {"leap_at": 8}, "joint 'motor 1' reads 2.8 rad, 3 rad from the last reading"),
+    ],
+    ids=["too fast", "leaps"],
+)
 @settings(max_examples=10, deadline=None)
 @given(rows=mountings)
-def test_a_joint_that_is_too_fast_is_stopped_whatever_its_gear(rows):
-    seen, why, _ = compare(VOLTAGE, rows, np.full((60, N), [1.1, 0.0]), gate_of(VOLTAGE, max_speed_rad_s=0.5))
-    assert "joint 'motor 0' is beyond the limit of 0.5 rad/s" in why
-    assert 0.3 < seen[-1, N] < 0.5
-
-
-@settings(max_examples=10, deadline=None)
-@given(rows=mountings)
-def test_a_leap_of_a_joint_is_one_whatever_its_gear(rows):
-    seen, why, _ = compare(VOLTAGE, rows, np.zeros((20, N)), leap_at=8)
-    assert "joint 'motor 1' reads 2.8 rad, 3 rad from the last reading" in why
-    assert len(seen) == 7
+def test_what_stops_a_joint_stops_it_whatever_its_gear(wanted, gate, device, words, rows):
+    seen, why, _ = compare(VOLTAGE, rows, np.full((60, N), wanted), gate_of(VOLTAGE, **gate), **device)
+    assert words in why
+    assert len(seen) == 7 if device else 0.3 < seen[-1, N] < 0.5
 
 
 @settings(max_examples=30, deadline=None)
@@ -158,40 +171,41 @@ def test_a_gate_is_refused_for_the_joints_that_a_plain_one_would_be_refused_for(
     Rig(Bench(kind, rows, reach=(-0.9 - 1e-9, 1.0 + 1e-9)), gate_of(kind, limit=(-0.9, 1.0)), joints).close()
 
 
-def test_a_stale_command_is_held_or_zero_at_the_joints():
-    rows = ((0.4, -1, 3.0), (-0.2, 1, 0.5))
-    for kind, expected in ((POSITION, [0.5, -0.4]), (VOLTAGE, [0.0, 0.0])):
-        device = Bench(kind, rows)
-        with Rig(device, gate_of(kind, slew_per_s=None), as_joints(rows)) as rig:
-            rig.start()
-            rig.command(np.array([0.5, -0.4]), 0.0, 0.0)
-            np.testing.assert_allclose(rig.command(np.array([0.1, 0.1]), 99.0, 0.1), expected)
-            np.testing.assert_allclose(device.heard[-1], device.to_motor(np.array(expected)))
+CONTROLLERS = CommandKind.of_columns(
+    "controllers",
+    *(CommandColumn(n, u, "zero") for n, u in (("q", "rad"), ("kp", "N m/rad"), ("kd", "N m s/rad"))),
+)
 
 
-def test_torques_and_loads_in_newton_metres_grow_by_the_gear():
-    class Torques(Bench):
-        load_unit = "N m"
-
-    device = Torques(TORQUE, PLAIN)
-    mounting = Mounting(as_joints([(0.5, -1, 4.0), (0.0, 1, 0.5)]), device)
-    np.testing.assert_allclose(mounting.to_motors(np.array([2.0, 2.0])), [-0.5, 4.0])
-    np.testing.assert_allclose(mounting.to_joints(np.array([-0.5, 4.0])), [2.0, 2.0])
-    reading = Reading(np.array([0.5, 1.0]), np.array([4.0, 1.0]), np.array([-0.5, 4.0]), Transaction(0, 0, 0, 0))
-    joint = mounting.reading(reading)
-    np.testing.assert_allclose(
-        [joint.position_rad, joint.velocity_rad_s, joint.load], [[0.0, 2.0], [-1.0, 2.0], [2.0, 2.0]]
-    )
+@pytest.mark.parametrize(
+    ("kind", "joints", "motors"),
+    [
+        # The same torque acts on the joint: kp_joint * angle = gear * kp_motor * (gear * angle).
+        (CONTROLLERS, [[0.5, 20.0, 1.0], [-0.5, 30.0, 1.0]], [[0.1 - 2.0 * 0.5, 5.0, 0.25], [-0.25, 120.0, 4.0]]),
+        (TORQUE, [2.0, 2.0], [-1.0, 4.0]),
+    ],
+)
+def test_columns_torques_and_loads_of_geared_joints(kind, joints, motors):
+    device = SimpleNamespace(motors=("a", "b"), commanded=kind, load_unit="N m")
+    mounting = Mounting([Joint("a", 0.1, -1, 2.0), Joint("b", gear=0.5)], device)
+    np.testing.assert_allclose(mounting.to_motors(np.array(joints)), motors)
+    np.testing.assert_allclose(mounting.to_joints(np.array(motors)), joints)
+    seen = mounting.reading(Reading(np.array([0.5, 1]), np.array([4.0, 1]), np.array([-1, 4.0]), NEVER))
+    rows = (seen.position_rad, seen.velocity_rad_s, seen.load)
+    np.testing.assert_allclose(rows, [[-0.2, 2.0], [-2.0, 2.0], [2.0, 2.0]])
 
 
 def test_a_plain_joint_changes_no_bit():
+    assert Joint.of("hinge") == Joint("hinge", 0.0, 1, 1.0)
+    assert Joint.of("hinge").is_plain
+    assert not any(joint.is_plain for joint in (Joint("a", gear=2.0), Joint("a", 0.1), Joint("a", direction=-1)))
     device = Bench(POSITION, PLAIN)
     values = np.random.default_rng(0).normal(size=N)
     for joints in ((), as_joints(PLAIN)):
         mounting = Mounting(joints, device)
         assert np.array_equal(mounting.to_motors(values), values)
         assert np.array_equal(mounting.to_joints(values), values)
-        reading = mounting.reading(Reading(values, values, np.array([np.nan, 1.0]), Transaction(0, 0, 0, 0)))
+        reading = mounting.reading(Reading(values, values, np.array([np.nan, 1.0]), NEVER))
         assert np.array_equal(reading.position_rad, values)
         assert np.array_equal(reading.load, [np.nan, 1.0], equal_nan=True)
 
@@ -209,56 +223,31 @@ def test_joints_that_do_not_fit_the_device_are_refused_before_it_is_opened():
         Rig(Unopened(odd, PLAIN), gate_of(odd), [Joint("a"), Joint("b", gear=2.0)])
 
 
-class Flywheels:
-    """A plant in memory that keeps what it was told."""
-
-    servo_ids = (4, 7)
-
-    def __init__(self, start):
-        self.start, self.told = start, []
-
-    def advance(self, t_s):
-        self.told.append(("advance", t_s))
-
-    def command(self, servo_id, mode, goal):
-        self.told.append((servo_id, mode, goal))
-
-    def configure(self, servo_id, p_gain, d_gain, profile_velocity_rad_s):
-        self.told.append((servo_id, p_gain, d_gain, profile_velocity_rad_s))
-
-    def measure(self, servo_id):
-        return self.start[servo_id - 4], 2.0, 0.5
-
-    def state(self):
-        return {"q": 1.0}
-
-    def truth(self):
-        return {"friction": 3.0}
-
-
 def test_a_mounted_plant_is_seen_through_its_encoders():
-    centre = np.pi
+    """Servo 4 turns twice as far as its joint, the other way; servo 7 half as far."""
+    centre, plant = (
+        np.pi,
+        Mock(servo_ids=(4, 7), **{"state.return_value": {"q": 1.0}, "truth.return_value": {"f": 3.0}}),
+    )
+    plant.measure.side_effect = {4: (centre + 0.4, 2.0, 0.5), 7: (centre - 1.0, 2.0, 0.5)}.get
     joints = [Joint("a", zero_rad=0.3, direction=-1, gear=2.0), Joint("b", gear=0.5)]
-    start = [centre + 0.4, 0.0, 0.0, centre - 1.0]
-    plant = MountedPlant(Flywheels(start), joints, centre)
-    assert plant.servo_ids == (4, 7)
-    np.testing.assert_allclose(plant.measure(4), [centre + 0.3 - 0.8, -4.0, -0.5])
-    np.testing.assert_allclose(plant.measure(7), [centre - 0.5, 1.0, 0.5])
-    plant.command(4, OperatingMode.POSITION, plant.measure(4)[0])
-    plant.command(4, OperatingMode.VELOCITY, 3.0)
-    plant.command(4, OperatingMode.PWM, 0.7)
-    plant.command(7, OperatingMode.OFF, 0.0)
-    plant.configure(4, 800, 0, 5.0)
-    plant.configure(7, 800, 0, np.inf)
-    plant.advance(0.1)
-    told = plant._plant.told
-    np.testing.assert_allclose([goal for _, _, goal in told[:4]], [centre + 0.4, -1.5, -0.7, 0.0])
-    assert [row[:3] for row in told[4:6]] == [(4, 800, 0), (7, 800, 0)]
-    assert [row[3] for row in told[4:6]] == [2.5, np.inf]
-    assert told[-1] == ("advance", 0.1)
-    assert (plant.state(), plant.truth()) == ({"q": 1.0}, {"friction": 3.0})
+    mounted = MountedPlant(plant, joints, centre)
+    assert mounted.servo_ids == (4, 7)
+    np.testing.assert_allclose(mounted.measure(4), [centre + 0.3 - 0.8, -4.0, -0.5])
+    np.testing.assert_allclose(mounted.measure(7), [centre - 0.5, 1.0, 0.5])
+    goals = {OperatingMode.POSITION: (mounted.measure(4)[0], centre + 0.4), OperatingMode.VELOCITY: (3.0, -1.5),
+             OperatingMode.PWM: (0.7, -0.7), OperatingMode.OFF: (0.0, 0.0)}  # fmt: skip
+    for mode, (seen, own) in goals.items():
+        mounted.command(4, mode, seen)
+        assert plant.command.call_args.args == (4, mode, pytest.approx(own))
+    for servo_id, speed, own in ((4, 5.0, 2.5), (7, np.inf, np.inf)):
+        mounted.configure(servo_id, 800, 0, speed)
+        assert plant.configure.call_args.args == (servo_id, 800, 0, own)
+    mounted.advance(0.1)
+    plant.advance.assert_called_once_with(0.1)
+    assert (mounted.state(), mounted.truth()) == ({"q": 1.0}, {"f": 3.0})
     with pytest.raises(UsageError, match="1 joints are mounted on 2 servos"):
-        MountedPlant(Flywheels(start), joints[:1], centre)
+        MountedPlant(plant, joints[:1], centre)
 
 
 @pytest.mark.parametrize(
@@ -269,9 +258,3 @@ def test_a_mounted_plant_is_seen_through_its_encoders():
 def test_what_cannot_be_converted_is_refused(wrong, said):
     with pytest.raises(UsageError, match=f"joint 'elbow'.*{said}"):
         Joint("elbow", **wrong)
-
-
-def test_a_name_stands_for_a_joint_that_turns_with_its_encoder():
-    assert Joint.of("hinge") == Joint("hinge", 0.0, 1, 1.0)
-    assert Joint.of("hinge").is_plain
-    assert not any(joint.is_plain for joint in (Joint("a", gear=2.0), Joint("a", 0.1), Joint("a", direction=-1)))

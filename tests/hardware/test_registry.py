@@ -3,8 +3,6 @@
 import pytest
 
 from sim2real.errors import UsageError
-from sim2real.hardware.bus.servos import VoltageDrive
-from sim2real.hardware.dynamixel import DynamixelServos
 from sim2real.hardware.registry import available, load_device
 
 PACKAGE = """
@@ -27,13 +25,6 @@ def installed(tmp_path, monkeypatch):
     lines = [f"{name} = {value}" for name, value in entries.items()]
     (info / "entry_points.txt").write_text("\n".join(["[sim2real.devices]", *lines, ""]))
     monkeypatch.syspath_prepend(tmp_path)
-
-
-def test_the_servos_that_come_with_sim2real_have_names():
-    device = load_device("dynamixel")("/dev/none", [3], VoltageDrive(5.0), baud_rate=57_600, silence_s=0.2)
-    assert isinstance(device, DynamixelServos)
-    assert device.motors == ("servo 3",)
-    assert (device.silence_s, device.config.baud_rate) == (0.2, 57_600)
 
 
 def test_a_package_brings_a_device_by_an_entry_point(installed):

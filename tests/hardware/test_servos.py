@@ -62,16 +62,6 @@ def run(rig, goal, duration_s, period_s=0.02):
     return np.array(sent), reading
 
 
-def test_angles_count_from_the_joints_zero(rig_of):
-    drive = PositionDrive(800, 20.0, joints=(Joint("b", 2, 1000), Joint("c", 3, 3000)))
-    zeros = (np.array([2048, 1000, 3000]) - 2048) * COUNT_RAD
-    rig, _ = rig_of(drive=drive, limit=(-1.5, 1.0))
-    assert rig.measure().position_rad == pytest.approx(START_RAD - zeros, abs=COUNT_RAD)
-    rig.start()
-    _, reading = run(rig, [0.1, 0.2, -0.3], 0.8)
-    assert reading.position_rad == pytest.approx([0.1, 0.2, -0.3], abs=2 * COUNT_RAD)
-
-
 def test_a_direction_and_a_zero():
     joints = [Joint("a", 1, direction=-1), Joint("b", 2), Joint("c", 3, zero_count=2148)]
     expected = np.array([-0.5, -0.8, 0.3 - 100 * COUNT_RAD])
@@ -172,19 +162,6 @@ def test_one_servo_confirms_its_goals():
         assert device.command(np.array([0.51])).transfer_ns == 10_000 * (9 + 6)
 
 
-def test_slew_starts_where_the_joints_are_also_outside_the_limits(rig_of):
-    rig, _ = rig_of(slew_per_s=2.0, limit=([-1.0, -0.4, -1.0], 1.0))
-    for goal in ([0.0, 0.0, 0.0], [1.0, -0.4, -1.0]):
-        present = rig.measure().position_rad
-        rig.start()
-        sent, reading = run(rig, goal, 0.5)
-        assert sent[0] == pytest.approx(present, abs=1.5 * COUNT_RAD)
-        assert np.abs(np.diff(sent, axis=0)).max() <= 2.0 * 0.1
-        assert np.abs(sent[-1] - sent[0]).max() > 0.5
-        assert np.abs(reading.position_rad - sent[-1]).max() < 0.2
-        rig.stop()
-
-
 def test_a_soft_stop_leaves_the_goals_where_they_are_until_all_is_still(rig_of):
     rig, robot = rig_of(stop_s=2.0, slew_per_s=3.0)
     rig.start()
@@ -209,12 +186,12 @@ def test_goals_outside_the_range_are_refused(angle):
         assert (low[0], high[0]) == pytest.approx((joints[0].angle(1700), joints[0].angle(4000)), abs=0.51 * COUNT_RAD)
         with pytest.raises(SafetyStop, match=r"joint 'pan': .* rad is outside"):
             device.command(np.array([angle, 0.0, 0.0]))
-
-
-@pytest.mark.parametrize("volts", [5.1, -10.0, math.nan, math.inf])
-def test_voltages_out_of_range_are_refused(volts):
-    with VOLTS.device(VOLTS.robot()) as device, pytest.raises(SafetyStop, match=r"'servo 2': .* V is outside \[-5"):
-        device.command(np.array([0.0, volts, 0.0]))
+    volts = angle if math.isnan(angle) else 2.0 * angle + 4.0
+    with VOLTS.device(VOLTS.robot()) as device:
+        device.command(np.array([0.0, 5.0, -5.0]))
+        if not abs(volts) <= 5.0:
+            with pytest.raises(SafetyStop, match=r"'servo 2': .* V is outside \[-5"):
+                device.command(np.array([0.0, volts, 0.0]))
 
 
 @BOTH
@@ -382,14 +359,6 @@ def test_facts_for_a_log_are_those_of_the_registers():
             "voltage": "12.0 V",
             "temperature": "30 °C",
         }
-
-
-def test_what_they_do_without_a_host_is_said():
-    with feetech(STS.robot()) as device:
-        (said,) = device.without_host()
-    assert said == "STS3215 (servo 1, servo 2, servo 3) goes on as commanded last (it has no bus watchdog)"
-    with angles(VOLTS.robot(settings={"model_number": 1200}), VoltageDrive(5.0), silence_s=0.1) as device:
-        assert device.without_host()[0].endswith("notices after 0.1 s, but goes on as commanded last")
 
 
 def test_servos_by_the_devices_name():

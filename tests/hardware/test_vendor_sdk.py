@@ -134,11 +134,3 @@ def test_a_motor_turns_only_with_torque(sdk):
     sdk.write(1, reg.TORQUE_ENABLE, 0)
     sdk.robot.sleep(0.4)
     assert sdk.read(1, reg.PRESENT_VELOCITY)[0] == 0
-
-
-def test_a_position_is_reached(sdk):
-    sdk.write(2, reg.TORQUE_ENABLE, 1)
-    assert sdk.write(2, reg.GOAL_POSITION, 5000) == (OK, StatusError.DATA_LIMIT)
-    sdk.write(2, reg.GOAL_POSITION, 400)
-    sdk.robot.sleep(0.8)
-    assert sdk.read(2, reg.PRESENT_POSITION)[0] == pytest.approx(400, abs=1)

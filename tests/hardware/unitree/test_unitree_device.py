@@ -1,8 +1,6 @@
 """The legs of a robot that behaves, what is refused, and other programs on its topics; over DDS."""
 
 import math
-import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -46,14 +44,6 @@ def other(robot):
     link.close()
 
 
-def test_facts_for_a_log_are_those_of_a_state(robot, device):
-    with device:
-        facts = device.facts()
-    assert (facts["firmware"], facts["voltage"]) == ({"battery": "1.4"}, {"battery": "29.6 V"})
-    assert list(facts["temperature"]) == list(device.motors)
-    assert set(facts["temperature"].values()) == {"35 °C"}
-
-
 def run(device, command, seconds, each=lambda: None):
     """Command and measure."""
     end_ns = device.clock.now_ns() + round(1e9 * seconds)
@@ -66,6 +56,9 @@ def run(device, command, seconds, each=lambda: None):
 @pytest.mark.parametrize("robot", ["stand"], indirect=True)
 def test_joints_in_another_order_move_and_are_measured(robot, device):
     device.open()
+    facts = device.facts()
+    assert (facts["firmware"], facts["voltage"]) == ({"battery": "1.4"}, {"battery": "29.6 V"})
+    assert facts["temperature"] == dict.fromkeys(device.motors, "35 °C")
     device.enable()
     goal = np.tile([0.0, 0.0, 60.0, 3.0, 0.0], (12, 1))
     goal[:, 0] = LYING
@@ -83,6 +76,8 @@ def test_joints_in_another_order_move_and_are_measured(robot, device):
     np.testing.assert_allclose(reading.parts["accelerometer"], [0, 0, 9.81], atol=0.5)
     assert device.without_host()[0].endswith("goes on as commanded last (no other reaction is documented)")
     device.disable()
+    with pytest.raises(SafetyStop, match="the torque is off"):
+        device.command(goal)
     assert ways(robot)[0] == [DAMPS, CONTROLS, DAMPS, OFF]
     # It is the fifth motor of the messages.
     t_ns, states = robot.truth().states()
@@ -101,15 +96,6 @@ def test_a_command_beyond_the_reach_is_not_sent(column, value, words):
     values[0, column] = value
     with pytest.raises(SafetyStop, match=words):
         device.command(values)
-
-
-def test_torque_that_was_taken_off_stays_off(device):
-    device.open()
-    rest = device.enable()
-    device.disable()
-    with pytest.raises(SafetyStop, match="the torque is off"):
-        device.command(rest)
-    assert device.counters.transactions > 0
 
 
 def stand(link):
@@ -154,30 +140,14 @@ def test_a_robot_that_was_left_on_is_laid_down_first(robot, device, other):
     assert ways(robot)[0] == [CONTROLS, DAMPS, OFF]
 
 
-@pytest.mark.parametrize(
-    ("port", "words"), [("eth0:233", "'233' is not a DDS domain"), ("eth0:x", "'x' is not a DDS domain")]
-)
-def test_a_port_without_a_domain_is_refused(port, words):
-    with pytest.raises(UsageError, match=words):
-        UnitreeLegs(port)
-
-
 def test_an_address_is_an_interface_and_a_domain():
     assert Address.parse("eth0") == Address("eth0", 0)
     assert 'address="192.168.123.99"' in Address.parse("192.168.123.99:3").config
     assert Address.parse(":4").config is None
+    for domain in ("233", "x"):
+        with pytest.raises(UsageError, match=f"'{domain}' is not a DDS domain"):
+            UnitreeLegs(f"eth0:{domain}")
     with pytest.raises(UsageError, match="0 to 11, each once"):
         load_device("unitree")("lo:1", (1, 2), LegDrive(), baud_rate=0, silence_s=0.1)
     with pytest.raises(UsageError, match="at most kd_max = 2"):
         LegDrive(damping=5.0, kd_max=2.0)
-
-
-def test_the_guide_makes_the_device_and_has_its_limits():
-    page = (Path(__file__).parents[3] / "docs" / "guides" / "unitree.md").read_text()
-    found = {}
-    exec(re.search(r"```python\n(.*?)```", page, re.DOTALL)[1], found)
-    drive = found["legs"].drive
-    for words in (f"`LegDrive.kp_max`, {drive.kp_max:g}", f"`LegDrive.damping`, {drive.damping:g}"):
-        assert words in page
-    assert f"`LegDrive.lie_s`, {drive.lie_s:g} s" in page
-    assert all(f"`{name}`" in page for name in found["legs"].parts)

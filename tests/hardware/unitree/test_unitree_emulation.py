@@ -109,16 +109,6 @@ def test_commands_act_and_states_age_by_their_latencies(emulated, tmp_path):
     np.testing.assert_array_equal(effects["t_ns"] - effects["t_host_ns"], 7 * MS)
 
 
-def test_motors_without_their_host_go_on_until_the_next_command(emulated):
-    legs, body, _ = emulated()
-    legs.receive(command(tau=1.5), 0)
-    legs.advance(25 * MS)
-    np.testing.assert_allclose(body.measure()["tau_est"], 1.5)
-    legs.receive(command(tau=0.5), 25 * MS)
-    legs.advance(30 * MS)
-    np.testing.assert_allclose(body.measure()["tau_est"], 0.5)
-
-
 def test_states_have_noise_of_the_size_that_the_settings_name(emulated):
     legs, _, _ = emulated(gyro_noise_rad_s=0.02, tilt_noise_rad=0.004, position_noise_rad=0.001)
     legs.advance(10 * MS)
