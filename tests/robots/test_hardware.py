@@ -11,6 +11,7 @@ from sim2real.emulation.truth import Kind, read_truth
 from sim2real.errors import SafetyStop, UsageError
 from sim2real.hardware.bus.servos import ServoJoint
 from sim2real.hardware.device import OperatingMode
+from sim2real.hardware.joint import Joint
 from sim2real.hardware.safety.gate import GateLimits
 from sim2real.log.reader import read_log
 from sim2real.robots.nodes import Excitation, connected, deployment_nodes, recording_nodes
@@ -164,12 +165,6 @@ def test_the_log_says_what_the_episode_was_about_and_the_simulations_trial_is_th
     np.testing.assert_array_equal(simulated["agent"].aim, expected)
 
 
-def test_torque_is_on_during_episodes_and_off_at_the_end(episodes):
-    modes = episodes.truth.of(Kind.EFFECT)["values"][:, 0]
-    assert np.count_nonzero(modes == OperatingMode.POSITION) > 100
-    assert modes[-3:].tolist() == [OperatingMode.OFF] * 3
-
-
 def test_a_joint_without_weight_is_brought_back_to_where_episodes_start(episodes):
     left, back = episodes.left_at, episodes.brought_to
     assert left[0] > 0.3
@@ -223,3 +218,27 @@ def test_an_excitation_of_no_numbers_is_refused():
     signal[2, 1] = np.nan
     with pytest.raises(UsageError, match="not finite"):
         Excitation("agent", 50.0, signal)
+
+
+def test_goals_and_limits_are_the_joints_on_the_bus_too(arm, tmp_path):
+    """The servos turn up to twice as far, some of them the other way; the true joints go where they are told."""
+    joints = (Joint("pan", 0.5, -1, 1.5), Joint("shoulder", -0.2, 1, 2.0), Joint("elbow", 0.1, -1, 0.8))
+    robot = changed(arm, joints=joints)
+    goal = np.array([0.4, -0.3, 0.5])
+    with connected(
+        robot.drive, "embedded", GateLimits(command_timeout_s=0.2, servo_watchdog_s=0.6), tmp_path / "truth.bin", 0
+    ) as rig:
+        robot.drive.prepare(rig, 5.0)
+        nodes = recording_nodes(robot, rig, np.tile(goal, (90, 1)))
+        Bench(robot, rig, Config()).run_episode(nodes, {}, tmp_path / "log.mcap", 1.6, "record")
+    episode, truth = read_log(tmp_path / "log.mcap"), read_truth(tmp_path / "truth.bin")
+    position = episode.outputs["sensor"]["position"]
+    np.testing.assert_allclose(episode.outputs["actuator"]["goal"][-1], goal, atol=1e-6)
+    np.testing.assert_allclose(position[-1], goal, atol=0.05)
+    _, states = truth.states()
+    true = np.stack([states[f"position[{i}]"] for i in range(3)], axis=1)
+    np.testing.assert_allclose(np.abs(true).max(axis=0), np.abs(position).max(axis=0), atol=0.01)
+    for i, joint in enumerate(joints):
+        goals = truth.of(Kind.EFFECT, i + 1)["values"]
+        sent = goals[goals[:, 0] == OperatingMode.POSITION][-1, 1] - np.pi
+        assert sent == pytest.approx(joint.encoder(goal[i]), abs=0.001)

@@ -1,6 +1,5 @@
 """Joints that were not recorded: what is held changes no inertia and no force of the others."""
 
-import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -193,26 +192,6 @@ def test_what_a_coupling_moves_is_never_held(tmp_path, rest, joints, free, left)
     model = driven(path, joints, 0.002, False, False)
     assert {model.joint(i).name for i in range(model.njnt)} == {*joints} | free
     assert (model.neq, model.ntendon) == left
-
-
-FOUR_BAR = """<mujoco><default><geom type="capsule" size=".01"/><joint axis="0 1 0"/></default><worldbody>
-<body name="crank"><joint name="crank" damping=".01"/><geom fromto="0 0 0 0 0 .1" mass=".1"/>
- <body name="coupler" pos="0 0 .1"><joint name="p1"/><geom fromto="0 0 0 .2 0 0" mass=".2"/></body></body>
-<body name="rocker" pos=".2 0 0"><joint name="p2"/><geom fromto="0 0 0 0 0 .1" mass=".1"/></body></worldbody>
-<equality><connect body1="coupler" body2="rocker" anchor=".2 0 0"/></equality></mujoco>"""
-
-
-@pytest.mark.night
-def test_a_loop_is_closed_at_the_start(tmp_path):
-    """Of a parallelogram the rocker turns with the crank, and the coupler stays level, also beyond half a turn."""
-    path = tmp_path / "bar.xml"
-    path.write_text(FOUR_BAR)
-    model = driven(path, ("crank",), 0.002, False, False)
-    close = jax.jit(jax.vmap(Closing(model, np.array([0]), np.array([0]))))
-    angles = jnp.array([0.0, 0.3, -0.9, 1.2, 4.0])[:, None]
-    qpos, qvel = close(angles, jnp.full((5, 1), 2.0))
-    np.testing.assert_allclose(qpos, angles * np.array([1.0, -1.0, 1.0]), atol=2e-3)
-    np.testing.assert_allclose(qvel[:4], np.tile([2.0, -2.0, 2.0], (4, 1)), atol=2e-2)
 
 
 def test_a_segment_of_a_mechanism_begins_with_its_loop_closed(tmp_path):

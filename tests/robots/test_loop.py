@@ -50,13 +50,9 @@ def drawn():
 
 def test_delays_to_identify_may_be_as_short_as_any_robots():
     sensor, actuator = delay_parameters(0.06)
-    assert (sensor.name, actuator.name) == DELAYS
-    assert (sensor.low, sensor.high, actuator.low, actuator.high) == (0.0, 0.06, 0.0, 0.12)
-    assert (sensor.free, actuator.free) == (False, True)
-    assert (sensor.side, actuator.side) == ("measurement", "command")
-    assert (sensor.leaf, actuator.leaf) == ("sensor.delay", "actuator.delay")
-    assert {sensor.kind, actuator.kind} == {"delay"}
-    assert {sensor.nominal, actuator.nominal} == {0.0}
+    rows = [(p.name, p.low, p.high, p.nominal, p.free, p.side, p.leaf) for p in (sensor, actuator)]
+    assert rows[0] == ("sensor_delay", 0.0, 0.06, 0.0, False, "measurement", "sensor.delay")
+    assert rows[1] == ("actuator_delay", 0.0, 0.12, 0.0, True, "command", "actuator.delay")
     table = ParameterTable([sensor, actuator])
     for x in (-30.0, 0.0, 30.0):
         found = table.decode(table.within(np.full(1, x)))

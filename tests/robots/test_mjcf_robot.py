@@ -112,53 +112,30 @@ def control(robot, values=None, **told):
     return np.asarray(world._control(state)).reshape(3, 2)
 
 
-KP = ParameterPattern("kp", nominal=10.0)
+def nominal(**terms):
+    return tuple(ParameterPattern(what, nominal=value) for what, value in terms.items())
 
 
-def test_positions_are_pulled_to_goals_by_the_encoder(model_file):
-    robot = MjcfRobot(config(model_file, terms=(KP, ParameterPattern("zero", each=True))))
-    force, kp, kd = control(robot, {"zero_left_knee": 0.1}, goal=[0.5, 0.2])
-    np.testing.assert_allclose(force, [4.0, 2.0], rtol=1e-6)
-    np.testing.assert_allclose(kp, 10.0)
-    assert not kd.any()
-
-
-def test_torque_that_is_off_leaves_what_short_circuited_windings_brake(model_file):
-    terms = (KP, ParameterPattern("kd", nominal=0.4), ParameterPattern("released", nominal=0.25))
-    robot = MjcfRobot(config(model_file, commands=("goal", "enabled"), terms=terms))
-    force, kp, kd = control(robot, goal=[0.5, 0.2], enabled=[0.0])
-    assert not force.any()
-    assert not kp.any()
-    np.testing.assert_allclose(kd, 0.1, rtol=1e-6)
-
-
-def test_mit_mode_takes_everything_from_the_log(model_file):
-    commands = ("goal", "goal_velocity", "torque", "kp", "kd")
-    robot = MjcfRobot(
-        config(
-            model_file,
-            commands=commands,
-            terms=(ParameterPattern("kp", nominal=1.0), ParameterPattern("kd", nominal=1.0)),
-        )
-    )
-    told = {"goal": [0.1, 0.2], "goal_velocity": [1.0, 2.0], "torque": [0.5, 0.0], "kp": [20.0, 10.0], "kd": [1.0, 2.0]}
-    force, kp, kd = control(robot, **told)
-    np.testing.assert_allclose(force, [20 * 0.1 + 1.0 * 1.0 + 0.5, 10 * 0.2 + 2.0 * 2.0], rtol=1e-6)
-    np.testing.assert_allclose((kp, kd), ([20, 10], [1, 2]))
-
-
-def test_a_firmwares_gain_counts_in_its_own_unit(model_file):
-    robot = MjcfRobot(config(model_file, commands=("goal", "kp"), kp_unit=200.0, terms=(KP,)))
-    np.testing.assert_allclose(control(robot, goal=[0.1, 0.1], kp=[400.0])[1], 20.0)
-
-
-@pytest.mark.parametrize(("commands", "told", "pushed"), [(("torque",), {"torque": [0.3, 0.1]}, [0.6, 0.2]),
-                                                          (("duty",), {"duty": [0.5, 1.0]}, [1.0, 2.0])])  # fmt: skip
-def test_torques_and_duties_push_in_proportion(model_file, commands, told, pushed):
-    robot = MjcfRobot(config(model_file, commands=commands, terms=(ParameterPattern("gain", nominal=2.0),)))
-    force, kp, _ = control(robot, **told)
-    np.testing.assert_allclose(force, pushed, rtol=1e-6)
-    assert not kp.any()
+@pytest.mark.parametrize(
+    ("options", "told", "pushed"),
+    [
+        # Positions are pulled to goals, by the encoder's angle.
+        ({"terms": (*nominal(kp=10.0), ParameterPattern("zero", each=True))}, {"goal": [0.5, 0.2]}, ([4, 2], 10, 0)),
+        # Torque that is off leaves what short-circuited windings brake.
+        ({"terms": nominal(kp=10.0, kd=0.4, released=0.25)}, {"goal": [0.5, 0.2], "enabled": [0.0]}, (0, 0, 0.1)),
+        # MIT mode takes everything from the log.
+        ({"terms": nominal(kp=1.0, kd=1.0)}, {"goal": [0.1, 0.2], "goal_velocity": [1.0, 2.0], "torque": [0.5, 0.0],
+         "kp": [20.0, 10.0], "kd": [1.0, 2.0]}, ([20 * 0.1 + 1.0 * 1.0 + 0.5, 10 * 0.2 + 2.0 * 2.0], [20, 10], [1, 2])),
+        # A firmware's gain counts in its own unit.
+        ({"terms": nominal(kp=10.0), "kp_unit": 200.0}, {"goal": [0.1, 0.1], "kp": [400.0]}, (2.0, 20.0, 0)),
+        ({"terms": nominal(gain=2.0)}, {"torque": [0.3, 0.1]}, ([0.6, 0.2], 0, 0)),
+        ({"terms": nominal(gain=2.0)}, {"duty": [0.5, 1.0]}, ([1.0, 2.0], 0, 0)),
+    ],
+)  # fmt: skip
+def test_what_is_told_pushes_the_joints(model_file, options, told, pushed):
+    robot = MjcfRobot(config(model_file, commands=tuple(told), **options))
+    for found, expected in zip(control(robot, {"zero_left_knee": 0.1}, **told), pushed, strict=True):
+        np.testing.assert_allclose(found, np.broadcast_to(expected, 2), rtol=1e-6)
 
 
 def test_parameters_by_pattern_stand_where_they_belong(model_file):

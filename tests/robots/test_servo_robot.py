@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_robot import SERVOS, SHEET, VALUES, PairRobot
+from small_robot import SERVOS, VALUES, PairRobot
 
 from sim2real.graph.base import GraphState
 from sim2real.robots.agent import AgentParams
@@ -32,18 +32,6 @@ def test_a_data_sheets_gain_is_the_torque_of_a_step_of_error():
     assert sheet.full_rad == pytest.approx(counts * 2 * np.pi / 4096, rel=1e-6)
     assert sheet.gain == pytest.approx(1.4 / sheet.full_rad)
     assert (sheet.drive.p_gain, sheet.drive.speed_rad_s, sheet.drive.d_gain) == (800, 5.0, 0)
-
-
-def test_nominal_values_are_the_data_sheets_without_delays(pair):
-    assert pair.nominal() == {
-        "gain": pytest.approx(SHEET.gain),
-        "damping": 0.2,
-        "armature": 0.01,
-        "friction_left": 0.02,
-        "friction_right": 0.02,
-    }
-    for p in pair.model.dynamics():
-        assert p.low < p.nominal < p.high
 
 
 def test_fast_goals_cost_a_hundredth_of_the_mean_square_of_their_share_of_the_largest_speed(pair):
@@ -75,17 +63,14 @@ def test_a_simulation_starts_from_rest_and_each_trial_has_its_own_aim():
     aims = [float(p["agent"].aim[0]) for p in params]
     assert aims[0] != aims[1] == aims[2]
     assert aims[1] == float(robot.task.aim.draw(1)[0])
-
-
-def test_a_simulation_starts_where_the_robot_rested_also_beyond_the_bounds_of_its_goals(pair):
-    """A folded SO-101 lies on its stop: a start within the bounds of goals was 90 mrad away from it."""
-    beyond = np.asarray(pair.drive.servos.high) + 0.09
-    params = simulation_params(pair, pair.nominal(), None, measured=beyond)
+    # A folded SO-101 lies on its stop: a start within the bounds of goals was 90 mrad away from it.
+    beyond = np.asarray(robot.drive.servos.high) + 0.09
+    params = simulation_params(robot, robot.nominal(), None, measured=beyond)
     np.testing.assert_allclose(params["world"].qpos, beyond, rtol=1e-6)
     assert params["world"].qpos.dtype == np.float32
 
 
-def test_a_recording_begins_where_the_joints_are(pair):
+def test_a_recording_begins_where_the_joints_are_and_plays_around_the_middle(pair):
     reading = SimpleNamespace(position_rad=np.array([1.0, -0.3]))
     rig = SimpleNamespace(wait_until_still=lambda *_: reading)
     signal = 0.2 * np.sin(np.arange(100))[:, None] * np.ones(2)
@@ -96,15 +81,7 @@ def test_a_recording_begins_where_the_joints_are(pair):
     assert np.abs(np.diff(off, axis=0)).max() <= 1.0 / pair.drive.rate_hz + 1e-9
     np.testing.assert_array_equal(played[51:], signal[51:])
     np.testing.assert_array_equal(played[16:, 1], signal[16:, 1])
-
-
-def test_an_excitation_is_around_the_middle_and_waits_where_it_ends():
-    robot = PairRobot(replace(SERVOS, middle=(0.3, -0.2)))
-    reading = SimpleNamespace(position_rad=np.array([0.3, -0.2]))
-    rig = SimpleNamespace(wait_until_still=lambda *_: reading)
-    signal = 0.1 * np.sin(np.arange(40))[:, None] * np.ones(2)
-    agent = recording_nodes(robot, rig, signal)["agent"]
-    played = np.array([agent.step(SimpleNamespace(seq=k))[1].command for k in range(60)])
-    np.testing.assert_allclose(played[:40], signal + np.array([0.3, -0.2]))
-    np.testing.assert_allclose(played[40:], np.tile(played[39], (20, 1)))
-    np.testing.assert_allclose(robot.drive.centre, [0.3, -0.2])
+    middle = replace(SERVOS, middle=(1.0, -0.3))
+    agent = recording_nodes(PairRobot(middle), rig, signal)["agent"]
+    played = np.array([agent.step(SimpleNamespace(seq=k))[1].command for k in range(100)])
+    np.testing.assert_allclose(played, signal + np.array([1.0, -0.3]))

@@ -52,20 +52,14 @@ def identified(values, deviation=0.005):
     return Identification("go2", (), Judgement("accepted", ()), rows, posterior=posterior)
 
 
-def test_true_parameters_give_the_true_load(standing):
-    episode, values, load = standing
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.night) for seed in (0, 2, 6))])
+def test_true_parameters_give_the_true_load(standing, tmp_path, seed):
+    episode, values, load = standing if seed == 1 else logged(tmp_path, seed, standing=True)
     found = weighing.balances_of(ROBOT, episode, values).load(ROBOT, values)
     assert found == pytest.approx(load, abs=0.06)
     # Motors that are stronger by 3 % carry 3 % more than the robot's 15 kg and its load.
     stronger = {n: 1.03 * v if n.endswith("_strength") else v for n, v in values.items()}
     assert weighing.balances_of(ROBOT, episode, values).load(ROBOT, stronger) - found == pytest.approx(0.48, abs=0.06)
-
-
-@pytest.mark.night  # the quick test has one of these robots
-@pytest.mark.parametrize("seed", [0, 2, 6])
-def test_loads_of_other_robots(tmp_path, seed):
-    episode, values, load = logged(tmp_path, seed, standing=True)
-    assert weighing.balances_of(ROBOT, episode, values).load(ROBOT, values) == pytest.approx(load, abs=0.06)
 
 
 def test_the_load_has_an_interval_and_training_draws_it_beside_the_strengths(standing):
