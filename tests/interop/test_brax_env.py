@@ -31,28 +31,17 @@ def played(pendulum):
 
 
 def test_brax_sees_a_time_limit_as_a_truncation(played):
-    rows = played[2]
+    _, first, rows = played
     assert [np.flatnonzero(rows["done"][:, i]).tolist() for i in range(2)] == [[23, 47]] * 2
     np.testing.assert_array_equal(rows["truncation"], rows["done"])
     assert np.isfinite(rows["reward"]).all()
-
-
-def test_every_episode_starts_somewhere_else(played):
-    _, first, rows = played
+    # Every episode starts somewhere else; metrics are those of the whole episode, where it ends.
     starts = np.concatenate([first, rows["obs"][23], rows["obs"][47]])
     assert len(np.unique(starts[:, :2], axis=0)) == 6
-
-
-def test_metrics_are_those_of_the_whole_episode_where_it_ends(played):
-    rows = played[2]
     np.testing.assert_allclose(rows["return"][23], rows["reward"][:24].sum(axis=0), rtol=1e-4)
     assert not rows["return"][:23].any()
     assert set(rows) >= {"success"}
-
-
-def test_actions_between_minus_one_and_one_span_the_bounds(played):
-    rows = played[2]
-    np.testing.assert_allclose(rows["obs"][5][:, 15], 1.0)  # half of 2 V
+    np.testing.assert_allclose(rows["obs"][5][:, 15], 1.0)  # actions span the bounds: half of 2 V
 
 
 def test_past_the_time_limit_there_is_no_reward_to_learn_from(pendulum):

@@ -17,12 +17,8 @@ def test_the_nominal_model_has_delays_where_they_are_given(pendulum):
     assert sum(delays(pendulum).values()) == pytest.approx(0.045)
     assert delays(robot_environment("pendulum", "nominal")) == {}
     robot = sim2real.load_robot("pendulum")
-    assert robot_environment(robot, "nominal").env.task.values == robot.nominal()
-
-
-def test_parameters_may_have_other_values(pendulum):
-    made = robot_environment("pendulum", "nominal", {"damping": 3.5})
-    assert made.env.task.values["damping"] == 3.5
+    changed = robot_environment(robot, "nominal", {"damping": 3.5})
+    assert changed.env.task.values == {**robot.nominal(), "damping": 3.5}
 
 
 def test_what_does_not_exist_is_named(tmp_path):

@@ -4,19 +4,15 @@ import os
 from pathlib import Path
 from types import SimpleNamespace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from sim2real.graph.base import GraphState
 from sim2real.graph.episode import Episode, Steps
-from sim2real.graph.schedule import draw
-from sim2real.identification.parameter_paths import get_leaf
 from sim2real.identification.predictions import samples
 from sim2real.log.importing.importer import import_file
 from sim2real.log.importing.mapping import load_mapping
-from sim2real.runtime.compiled.graph import CompiledGraph
 
 REPOSITORY = Path(__file__).resolve().parent.parent.parent
 DATA = Path(os.environ.get("SIM2REAL_DATA", REPOSITORY.parent / "shared" / "data"))
@@ -66,55 +62,6 @@ def rmse(error):
     return np.sqrt(np.mean(np.square(error), axis=0))
 
 
-def check_leaves(model, delay_s):
-    """Every parameter's leaf exists in the parameters of the nodes, and its value arrives there, and nowhere else."""
-    nodes = model.nodes(delay_s)
-    table = model.parameters
-    zero = jnp.zeros(2 * len(model.channels))
-    nominal = {p.name: jnp.float32(p.nominal) for p in table}
-    base = model.params(nominal, zero)
-    assert set(base) <= set(nodes)
-    for name, own in base.items():
-        assert type(own) is type(nodes[name].init_params())
-    for p in table:
-        assert p.leaf is not None or p.name in fixed(table)
-        if p.leaf is None:
-            continue
-        assert p.low <= p.nominal <= p.high
-        other = p.low + 0.37 * (p.high - p.low)
-        moved = model.params({**nominal, p.name: jnp.float32(other)}, zero)
-        assert float(get_leaf(moved, p.leaf)) == pytest.approx(other, rel=1e-5)
-        for q in table:
-            if q.name != p.name and q.leaf is not None:
-                assert float(get_leaf(moved, q.leaf)) == pytest.approx(q.nominal, rel=1e-5, abs=1e-9)
-
-
-def check_start(model, delay_s, start):
-    """The graph builds and runs, and of the world's first output the sensor reads the measured start.
-
-    Returns:
-        The world's initial state and the nodes' parameters.
-    """
-    nodes = model.nodes(delay_s)
-    for name in model.given:  # it has no step of its own
-        nodes[name].step = lambda ss, node=nodes[name]: (ss, node.init_output())
-    graph = CompiledGraph(nodes, model.sensor, draw(nodes, 0.2))
-    params = model.params(
-        {p.name: jnp.float32(p.low + 0.37 * (p.high - p.low)) for p in model.parameters}, jnp.asarray(start)
-    )
-    _, records = jax.jit(lambda p: graph.rollout(graph.init(jax.random.key(0), params=p), (model.sensor,)))(params)
-    record = records[model.sensor]
-    readings = np.asarray(getattr(record.output, model.channels[0].position))[np.asarray(record.seq) >= 0]
-    assert len(readings) >= 0.2 * nodes[model.sensor].rate - 1
-    assert np.isfinite(readings).all()
-    gs = GraphState(params=params)
-    first = {-1: SimpleNamespace(data=nodes["world"].init_output(graph_state=gs))}
-    _, read = nodes[model.sensor].step(SimpleNamespace(params=params.get(model.sensor), inputs={"world": first}))
-    read = np.ravel(getattr(read, model.channels[0].position))
-    np.testing.assert_allclose(read, start[: len(model.channels)], atol=2e-6)
-    return nodes["world"].init_state(graph_state=gs), params
-
-
 def effects(problem, values, factor=0.1):
     """Return by how much each parameter moves the predictions [deviations], from values to ``factor`` of its bounds."""
     table = problem.table
@@ -147,16 +94,21 @@ class RecordedRobotConformance:
         delay_s = self.pipeline.defaults.identify.max_delay_s
         return self.pipeline.identifiable(delay_s), delay_s
 
-    def test_all_parameters_have_a_place(self):
-        check_leaves(*self.model())
-
-    def test_the_sensor_reads_the_measured_start(self):
-        state, params = check_start(*self.model(), list(self.start))
-        self.check_state(state, params)
-
     def check_state(self, state, params):
         """Compare the world's first state with the measured one, which is the joints' own unless an encoder is off."""
         np.testing.assert_allclose(np.ravel([state.position, state.velocity]), self.start, rtol=1e-6)
+
+    def test_the_sensor_reads_the_measured_start(self):
+        model, delay_s = self.model()
+        nodes = model.nodes(delay_s)
+        values = {p.name: jnp.float32(p.low + 0.37 * (p.high - p.low)) for p in model.parameters}
+        params = model.params(values, jnp.asarray(self.start))
+        gs = GraphState(params=params)
+        first = {-1: SimpleNamespace(data=nodes["world"].init_output(graph_state=gs))}
+        _, read = nodes[model.sensor].step(SimpleNamespace(params=params.get(model.sensor), inputs={"world": first}))
+        read = np.ravel(getattr(read, model.channels[0].position))
+        np.testing.assert_allclose(read, self.start[: len(model.channels)], atol=2e-6)
+        self.check_state(nodes["world"].init_state(graph_state=gs), params)
 
     def test_every_parameter_acts(self, problem):
         moved = effects(problem, self.truth)

@@ -75,18 +75,12 @@ def test_an_arm_that_arrives_and_stays_has_success(of):
         "first_reached_s": pytest.approx(1.5),
         **of.more,
     }
-
-
-def test_an_arm_that_passes_by_has_the_share_of_its_time_there(of):
+    # One that passes by has the share of its time there, and one that never comes near has none.
     angles = np.tile(of.there + np.eye(len(of.there))[1] * 0.5, (401, 1))
     angles[200:250] = of.there
     score = scored(of, angles, of.aim)
-    assert score["success"] == pytest.approx(50 / 201)
-    assert score["reached"] == 0.0
+    assert (score["success"], score["reached"]) == (pytest.approx(50 / 201), 0.0)
     assert score["first_reached_s"] == pytest.approx(2.0)
-
-
-def test_an_arm_that_never_comes_near_has_none(of):
     score = scored(of, np.tile(of.there, (401, 1)), [1.0, 1.0, 1.0, *of.aim[3:]])
     assert (score["success"], score["reached"]) == (0.0, 0.0)
     assert np.isnan(score["first_reached_s"])

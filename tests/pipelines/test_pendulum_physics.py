@@ -99,18 +99,3 @@ def trajectory(plant, duration_s, step_s=0.0005):
         rows.append((plant.data.qpos[0], plant.data.qvel[0]))
         plant.advance(begin + (i + 1) * step_s)
     return np.array(rows)
-
-
-def energy(plant, states):
-    """Kinetic and potential energy [J], by the plant's true groups times its inertia."""
-    groups = plant.truth()
-    return plant._J * (states[:, 1] ** 2 / 2 + groups["gravity"] * np.cos(states[:, 0]))
-
-
-def test_the_motor_brakes_only_while_torque_is_on():
-    """At 0 V the winding is shorted and the back-EMF brakes; with torque off it is open."""
-    slow, fast = released(PLANT.PendulumPlant(friction=0.0), np.pi, 5.0), released(PLANT.PendulumPlant(0.0), np.pi, 5.0)
-    slow.command(1, PWM, 0.0)
-    fast.command(1, OFF, 0.0)
-    lost = [energy(p, trajectory(p, 1.0))[[0, -1]] @ [1, -1] for p in (slow, fast)]
-    assert lost[0] > 20 * abs(lost[1])

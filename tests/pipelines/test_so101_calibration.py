@@ -10,7 +10,7 @@ from sim2real.commands.new import calibrate
 from sim2real.emulation.bus import VirtualRobot
 from sim2real.emulation.feetech import StsEmulation
 from sim2real.emulation.truth import Kind
-from sim2real.errors import HardwareLost, Sim2RealError, UsageError
+from sim2real.errors import Sim2RealError
 from sim2real.hardware.device import OperatingMode
 from sim2real.stages.load import load_module, load_robot
 
@@ -89,22 +89,3 @@ def test_a_fault_is_found_before_a_motor_moves(arm, tmp_path, fault):
         calibrate(wrong.port, GUIDE, tmp_path / "calibration.json")
     assert modes(wrong) <= {OperatingMode.OFF}
     assert not (tmp_path / "calibration.json").exists()
-
-
-def test_without_a_calibration_the_tool_that_makes_one_is_named(arm, tmp_path, monkeypatch):
-    new = arm()
-    monkeypatch.delenv("SO101_CALIBRATION")
-    monkeypatch.setenv("HF_LEROBOT_CALIBRATION", str(tmp_path / "none"))
-    with pytest.raises(UsageError, match="no calibration in") as told:
-        calibrate(new.port, GUIDE, tmp_path / "calibration.json")
-    assert "lerobot-calibrate" in str(told.value.hint)
-
-
-def test_two_servos_of_one_id_are_refused(arm, tmp_path, monkeypatch):
-    """Their answers collide on the wire; here the second one comes after the first."""
-    from sim2real.hardware.bus.link import ServoLink
-
-    real, alone = ServoLink.answering, arm()
-    monkeypatch.setattr(ServoLink, "answering", lambda self, packet, wait_s: 2 * real(self, packet, wait_s))
-    with pytest.raises(HardwareLost, match=r"two servos on .* have the id 1"):
-        calibrate(alone.port, GUIDE, tmp_path / "calibration.json")

@@ -87,11 +87,6 @@ class TestSO101Log(RecordedRobotConformance):
     start = (0.1, -0.2, 0.3, -0.4, 0.5, -0.6, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
 
 
-def test_every_channel_is_a_joint_of_its_own():
-    channels = PIPELINE.identifiable(MAX_DELAY_S).channels
-    assert [(c.position, c.index, c.name) for c in channels] == [("position", i, j) for i, j in enumerate(JOINTS)]
-
-
 def test_the_model_is_the_loop(synthetic):
     log, problem = synthetic
     true = log.outputs["sensor"]["position"]

@@ -68,17 +68,13 @@ def test_the_bundle_says_how_well_its_runner_agrees_with_jax(tmp_path, weights, 
 
 def test_a_policy_is_let_in_slowly_in_every_episode(bundle, observations):
     policy = load_bundle(bundle)
+    assert np.array_equal(BlendedRunner(policy, 0.0)(observations[0]), policy.act(observations[0]))
     blended = BlendedRunner(policy, blend_s=0.08)  # four steps at 50 Hz
     expected = policy.act(observations[0])
     for _ in range(2):
         blended.reset()
         shares = [blended(observations[0]) / expected for _ in range(6)]
         np.testing.assert_allclose(shares, np.outer([0.0, 0.25, 0.5, 0.75, 1.0, 1.0], [1.0, 1.0]), rtol=1e-6)
-
-
-def test_without_blending_the_first_action_is_the_policys(bundle, observations):
-    policy = load_bundle(bundle)
-    assert np.array_equal(BlendedRunner(policy, 0.0)(observations[0]), policy.act(observations[0]))
 
 
 def test_a_robot_that_leans_too_far_is_stopped(bundle, observations):
@@ -100,36 +96,20 @@ def test_actions_stay_within_the_contract(runner):
         assert actions[:, i].max() <= np.float32(term.high)
 
 
-def test_contract_and_weights_survive(bundle, contract, weights):
-    assert load_bundle(bundle).contract == contract
-    again = read_weights(bundle)
-    assert again.keys() == weights.keys()
-    assert all(np.array_equal(again[name], weights[name]) for name in weights)
-
-
-def test_onnx_carries_the_contract(bundle, contract):
-    onnx = pytest.importorskip("onnx")
-    model = onnx.load(bundle / "policy.onnx")
-    properties = {entry.key: entry.value for entry in model.metadata_props}
-    assert properties["action_names"] == "voltage,brake"
-    assert properties["observation_names"].split(",") == contract.observation_names
-    assert [d.dim_value for d in model.graph.input[0].type.tensor_type.shape.dim] == [1, 5]
-
-
-def test_names_with_commas_stay_apart_in_onnx(tmp_path, contract, weights, observations):
+def test_onnx_carries_the_contract(tmp_path, contract, weights, observations):
+    """Names with commas stay apart."""
     onnx = pytest.importorskip("onnx")
     terms = [dataclasses.replace(term, name=f"cos, sin, {term.name}") for term in contract.observation]
     renamed = dataclasses.replace(contract, observation=tuple(terms))
-    save_bundle(tmp_path / "renamed", weights, renamed, observations)
-    properties = {entry.key: entry.value for entry in onnx.load(tmp_path / "renamed" / "policy.onnx").metadata_props}
+    folder = save_bundle(tmp_path / "renamed", weights, renamed, observations)
+    assert load_bundle(folder).contract == renamed
+    assert all(np.array_equal(value, weights[name]) for name, value in read_weights(folder).items())
+    model = onnx.load(folder / "policy.onnx")
+    properties = {entry.key: entry.value for entry in model.metadata_props}
+    assert properties["action_names"] == "voltage,brake"
     names = [name.replace(";", ",") for name in properties["observation_names"].split(",")]
     assert names == renamed.observation_names
-
-
-def test_a_file_is_no_bundle(bundle):
-    for name in ("policy.onnx", "policy.json"):
-        with pytest.raises(Sim2RealError, match="is a file; a policy bundle is a folder"):
-            load_bundle(bundle / name)
+    assert [d.dim_value for d in model.graph.input[0].type.tensor_type.shape.dim] == [1, 5]
 
 
 def test_wrong_observations_are_refused(runner):
@@ -146,6 +126,10 @@ def test_damaged_files_are_refused(bundle, name, backend):
     (bundle / name).write_bytes(bytes(content))
     with pytest.raises(Sim2RealError, match=rf"{name} is not what was exported[\s\S]*hint: "):
         load_bundle(bundle, backend)
+    with pytest.raises(Sim2RealError, match="is a file; a policy bundle is a folder"):
+        load_bundle(bundle / name)
+    with pytest.raises(UsageError, match="no policy backend 'torch'; available: numpy, onnx"):
+        load_bundle(bundle, "torch")
 
 
 @pytest.mark.parametrize(
@@ -170,19 +154,16 @@ def test_a_contract_that_does_not_fit_is_refused(bundle, change, message):
         load_bundle(bundle)
 
 
-def test_weights_must_fit_the_contract(tmp_path, weights, contract):
-    with pytest.raises(Sim2RealError, match=r"layers\.1\.kernel has shape \(3, 64\), the contract asks for \(64, 64\)"):
-        save_bundle(tmp_path / "a", weights | {"layers.1.kernel": np.zeros((3, 64))}, contract)
-    with pytest.raises(Sim2RealError, match="high bounds are"):
-        save_bundle(tmp_path / "a", weights | {"high": np.array([2.0, 0.2])}, contract)
-    with pytest.raises(Sim2RealError, match="std holds values that are not finite"):
-        save_bundle(tmp_path / "a", weights | {"std": np.full(5, np.nan)}, contract)
-    assert not (tmp_path / "a").exists()
-
-
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
+        (
+            "layers.1.kernel",
+            np.zeros((3, 64)),
+            r"layers\.1\.kernel has shape \(3, 64\), the contract asks for \(64, 64\)",
+        ),
+        ("high", np.array([2.0, 0.2], np.float32), "high bounds are"),
+        ("std", np.nan, "std holds values that are not finite"),
         ("std", 0.0, "standard deviations down to 0"),
         ("std", -1.0, "standard deviations down to -1"),
         ("layers.1.kernel", 1e38, r"layers\.1\.kernel holds values up to 1e\+38"),
@@ -192,9 +173,13 @@ def test_weights_must_fit_the_contract(tmp_path, weights, contract):
 )
 def test_absurd_weights_are_refused(bundle, tmp_path, weights, contract, name, value, message):
     bent = {n: v.copy() for n, v in weights.items()}
-    bent[name].flat[0] = value
-    with pytest.raises(Sim2RealError, match=rf"(?s){message}.*hint: "):
+    if np.ndim(value):
+        bent[name] = value
+    else:
+        bent[name].flat[0] = value
+    with pytest.raises(Sim2RealError, match=message):
         save_bundle(tmp_path / "a", bent, contract)
+    assert not (tmp_path / "a").exists()
     content = safetensors.numpy.save(bent)  # and a bundle that was made by hand, with the right hash
     (bundle / "policy.safetensors").write_bytes(content)
     about = json.loads((bundle / "policy.json").read_text())
@@ -260,11 +245,6 @@ def test_values_that_no_policy_has_are_refused_though_the_hash_is_right(bundle, 
     file.write_text(json.dumps(sealed(changed(json.loads(file.read_text()), path, value))))
     with pytest.raises(Sim2RealError, match=r"hint: |must be|is no"):
         load_bundle(bundle)
-
-
-def test_an_unknown_backend_is_refused(bundle):
-    with pytest.raises(UsageError, match="no policy backend 'torch'; available: numpy, onnx"):
-        load_bundle(bundle, "torch")
 
 
 def test_running_a_bundle_imports_neither_jax_nor_onnx(bundle):

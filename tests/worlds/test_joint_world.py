@@ -142,19 +142,6 @@ def test_a_damped_pendulum_with_dry_friction_moves_and_stops_as_in_mujoco(start)
         assert abs(position[-1]) <= math.asin(DRY / GRAVITY)
 
 
-def test_several_joints_at_once_are_as_one_by_one():
-    world = Pendulum("w", 100)
-    params = tuple(jnp.array(x) for x in ([30.0, 10.0, 0.0], [0.7, 0.0, 5.0], [2.5, 0.0, 1.0]))
-    start, push = (np.array([1.5, -0.4, 0.0]), np.array([0.0, 6.0, 1.0])), jnp.array([0.0, 1.0, -3.0])
-    together = swing(world, params, start, 300, push)
-    for i in range(3):
-        alone = swing(world, tuple(p[i] for p in params), [s[i] for s in start], 300, push[i])
-        for a, b in zip(together, alone, strict=True):
-            np.testing.assert_allclose(
-                a[:, i], b, atol=1e-4
-            )  # float32, and 300 ticks to add up a processor's last bits
-
-
 def test_a_tick_is_split_into_equal_parts():
     assert Pendulum("w", 100, substep_s=0.002).substeps == 5  # exactly, though 0.01 / 0.002 is a little more
     assert Pendulum("w", 100, substep_s=0.003).substeps == 4

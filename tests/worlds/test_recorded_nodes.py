@@ -10,7 +10,7 @@ from oracles.hash_nodes import Value
 
 from sim2real.graph.base import Base, GraphState
 from sim2real.worlds.joint import Forces, JointState, JointWorld
-from sim2real.worlds.recorded import DelayParams, Encoder, RecordedSensor
+from sim2real.worlds.recorded import Encoder, RecordedSensor
 
 
 @struct.dataclass
@@ -48,13 +48,6 @@ def test_its_first_message_is_the_output_of_its_state():
     assert Doubled("world", 100.0).init_output(None, GraphState(state={"world": state})) == 14.0
     np.testing.assert_allclose(Doubled("world", 100.0).init_output(), [0.2, 0.4])
     assert Coasting("world", 100.0).init_output(None, GraphState(state={"world": state})) is state
-
-
-def test_its_commands_are_as_late_as_the_actuators_parameters_say():
-    world = Coasting("world", 100.0)
-    assert world.init_delays() == {}
-    assert world.init_delays(None, GraphState(params={"actuator": DelayParams()})) == {}
-    assert world.init_delays(None, GraphState(params={"actuator": DelayParams(0.02)})) == {"actuator": 0.02}
 
 
 def test_a_sensor_shows_positions_as_they_are_or_as_an_encoder_reads_them():
