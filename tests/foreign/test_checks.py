@@ -78,6 +78,18 @@ def test_a_clock_of_another_rate_is_found(rate, weight):
     assert "clock" in {f[0] for f in findings(GOAL[half], Q[half], T[half], T[half] * rate)}
 
 
+@pytest.mark.parametrize(("step_s", "weight"), [(0.4, "refuse"), (-0.06, "warn")])
+def test_a_clock_that_was_set_in_between_is_found(step_s, weight):
+    assert ("clock", -1, weight) in findings(t_goal=T + step_s * (T > 10.0))
+
+
+@pytest.mark.parametrize("apart_s", [-4.0, 5.0])
+def test_clocks_that_are_set_apart_are_refused_with_the_seconds(apart_s):
+    (found,) = [f for f in checks.check((T + apart_s, T), GOAL, Q, NAMES) if f.weight == "refuse"]
+    lag_s = float(found.text.split()[4])
+    assert (found.name, 0.0 < lag_s + apart_s < 0.3) == ("overlap", True)
+
+
 @pytest.mark.parametrize("rate", [0.98, 1.02])
 def test_a_clock_of_another_rate_is_found_in_a_short_gait(rate):
     """A motion that repeats follows its goal at many lags."""
@@ -97,6 +109,25 @@ def test_a_zero_that_steps_is_named_with_its_time(side, size):
     assert found.joint == 1
     assert found.weight == ("refuse" if side == "reading" and abs(size) > 0.1 else "warn")
     assert "9.0" in found.text
+
+
+@pytest.mark.parametrize(("size", "weight"), [(0.005, "warn"), (0.02, "refuse")])
+def test_the_zero_of_a_slide_is_judged_in_its_own_unit(size, weight):
+    q = 0.1 * Q + size * (T >= 9.0)[:, None] * np.array([0, 1, 0])
+    (found,) = [f for f in checks.check((T, T), 0.1 * GOAL, q, NAMES, unit="m") if f.name == "zero"]
+    assert (found.joint, found.weight, f"{size:+.3f} m from 9.00 s" in found.text) == (1, weight, True)
+
+
+def test_the_zero_of_a_joint_that_is_held_may_step_too():
+    rest = np.array([1, 0, 1])
+    q = Q * rest + 0.2 * (T >= 9.0)[:, None] * np.array([0, 1, 0])
+    assert ("zero", 1, "refuse") in findings(GOAL * rest, q)
+
+
+def test_joints_that_stay_outside_of_their_ranges_are_named():
+    ranges = {"a": (-1.0, 1.0), "b": (-2.7, -0.8)}
+    assert [f.joint for f in checks.beyond(Q, NAMES, ranges)] == [1]
+    assert checks.beyond(Q, NAMES, {}) == []
 
 
 @pytest.mark.parametrize("size", [0.05, 0.3])
@@ -131,6 +162,8 @@ def test_commands_that_are_too_slow_for_the_motion_are_said():
     found = checks._rates((t[::25], t), goal[::25, None], q[:, None])
     assert [f.name for f in found] == ["rate"]
     assert checks._rates((t[::2], t), goal[::2, None], q[:, None]) == []
+    at = np.flatnonzero(rng.random(len(t)) < 0.08)  # 20 a second, irregular
+    assert [f.name for f in checks._rates((t[at], t), goal[at, None], q[:, None])] == ["rate"]
 
 
 def test_a_joint_that_rests_is_said_and_one_held_elsewhere_is_asked():

@@ -24,6 +24,10 @@ _MAX_ROWS = 6000
 _FINER = 4
 """Compared rows for each sample, as a fast tone turns its sign within two samples."""
 _LAGS_S = (-0.3, 0.6)
+_CLOCK_LAGS_S = (-1.0, 1.5)
+"""Of parts, as a clock that was set changes the lag."""
+_APART_S = 60.0
+"""Clocks that are set apart by up to this time are found."""
 _FOLLOWS_R = 0.8
 """A position follows a command from this correlation on."""
 _STILL = 2e-3
@@ -73,6 +77,7 @@ CHECKS = {
     "zero": ("", "cut the file where the zero moves: --samples A:B"),
     "offset": ("", "give the goals an offset in a mapping, one number for each column"),
     "scale": ("", "name the other joints with --joints, or give the column its own scale in a mapping"),
+    "range": ("", "correct order, unit or zero in a mapping"),
     "rate": ("", "log both sides faster than the motion"),
     "still": ("", "move the joint"),
 }
@@ -92,6 +97,7 @@ def check(
     names: Sequence[str],
     by_name: bool = True,
     acting: np.ndarray | None = None,
+    unit: str = "rad",
 ) -> list[Check]:
     """Compare goals and positions of the same joints in one unit.
 
@@ -102,6 +108,7 @@ def check(
         names: Names of the joints.
         by_name: Whether names say which goal belongs to which position; else their order does, which must be evident.
         acting: Shape ``(N,)``: whether goals act; None: all do.
+        unit: Unit of both; empty for hinges beside slides.
     """
     found = respond(t_s, goal, position, acting)
     if found is None:
@@ -120,19 +127,25 @@ def check(
     rates = _rates(t_s, goal[:, moving], position[:, moving]) if moving else []
     if any(f.weight == "refuse" for f in clock):
         findings = [f for f in findings if f.name not in ("follows", "lag")]
+    elif moving and not following and not opposed and (apart := _apart(t_s, goal[:, moving], position[:, moving])):
+        findings = [f for f in findings if f.name not in ("follows", "lag")] + apart
     elif moving and not following and not any(f.weight in ("refuse", "ask") for f in findings):
         rates = [replace(f, weight="refuse") for f in rates]  # the cause
         text = "no position follows its goal: units, signs, order and clocks are unproven"
         findings += [] if rates else [Check("follows", -1, text, "ask")]
     findings += clock
     if following:
-        late = ", ".join(f"{names[i]} {1e3 * lag_s[i]:.0f} ms" for i in following[:6])
+        slopes = np.diag(fits[0].slope)
+        late = ", ".join(
+            f"{names[i]} {1e3 * lag_s[i]:.0f} ms{f' (slope {slopes[i]:.2f})' if abs(slopes[i] - 1) > 0.05 else ''}"
+            for i in following[:6]
+        )
         text = f"positions follow their goals: {late}" + " ..." * (len(following) > 6)
         findings.append(Check("follows", -1, text, "note"))
     if not any(f.weight == "refuse" for f in findings):
-        for i in moving:
+        for i in np.flatnonzero(found.spread[1] > _STILL).tolist():
             known_s = lag_s[i] if i in following else None
-            findings += _zero(t_s, goal[:, i], position[:, i], i, names[i], known_s)
+            findings += _zero(t_s, goal[:, i], position[:, i], i, names[i], known_s, unit)
     return [*findings, *rates, *odd_columns(position, names)]
 
 
@@ -152,7 +165,7 @@ def check_episode(episode: Episode, joints: Sequence[str] = (), by_name: bool = 
             names = joints if len(joints) == flat[1].shape[1] else list(map(str, range(flat[1].shape[1])))
             names = [f"joint {name}" if name.isdigit() else name for name in names]
             t_s = episode.steps["actuator"].begun_s, episode.steps["sensor"].begun_s
-            findings += check(t_s, *flat, names, by_name, acting)
+            findings += check(t_s, *flat, names, by_name, acting, units.get(name, ""))
     return findings
 
 
@@ -195,7 +208,11 @@ class Fit(NamedTuple):
 
 
 def respond(
-    t_s: tuple[np.ndarray, np.ndarray], command: np.ndarray, position: np.ndarray, acting: np.ndarray | None = None
+    t_s: tuple[np.ndarray, np.ndarray],
+    command: np.ndarray,
+    position: np.ndarray,
+    acting: np.ndarray | None = None,
+    lags_s: tuple[float, float] = _LAGS_S,
 ) -> Response | None:
     """Compare commands and positions on one grid of time; None if they overlap in fewer than 50 samples.
 
@@ -204,13 +221,14 @@ def respond(
         command: Shape ``(N, joints)``.
         position: Shape ``(M, joints)``.
         acting: Shape ``(N,)``: whether commands act; None: all do.
+        lags_s: Least and largest lag [s].
     """
     grid, held, joined, live = _on_grid(t_s, command, position, acting, _FINER)
     sample_s = min(float(np.median(np.diff(t))) for t in t_s)
     if len(grid) < 2 or live.sum() * (grid[1] - grid[0]) < 50 * sample_s:
         return None
     period_s = float(grid[1] - grid[0])
-    lags = np.arange(round(_LAGS_S[0] / period_s), round(_LAGS_S[1] / period_s) + 1)
+    lags = np.arange(round(lags_s[0] / period_s), round(lags_s[1] / period_s) + 1)
     least = round(50 * sample_s / period_s)
     lags = lags[np.abs(lags) < len(grid) - least]
     # At a lag, sum over the rows at which both the command then and the position now are known: by FFT, for all lags.
@@ -276,7 +294,8 @@ def _judge(
          f"{name}: its goals are copies of its measurements, so they hold no information on the drive"),
         ("sign", "ask", is_elsewhere and abs(level + held) < 0.3 * abs(held), away),
         ("slope", "ask", is_elsewhere, away),
-        ("still", "warn", not moves, f"{name} hardly moves: sign, order and unit are not checked"),
+        ("still", "warn", not moves,
+         f"{name}{_rests(found, i)} hardly moves: sign, order and unit are not checked"),
         ("order", "refuse", other_r > 0.9 and best < 0.6,
          f"{name} follows the goal of {names[other]} (r {other_r:.2f}), not its own (r {best:.2f})"),
         ("order", "ask", is_unclear,
@@ -294,6 +313,10 @@ def _judge(
     ]  # fmt: skip
     wrong = next((Check(name, i, text, weight) for name, weight, holds, text in table if holds), None)
     return wrong, moves
+
+
+def _rests(found: Response, i: int) -> str:
+    return "'s goal" if found.spread[1][i] > _STILL else ""
 
 
 def _is_clear(r: float, other_r: float, misfit: float, other_misfit: float) -> bool:
@@ -331,14 +354,16 @@ def _clock(
         if min(len(sent), len(read)) < 60:
             continue
         c, q = goal[sent][:, joints], position[read][:, joints]
-        part = respond((t_s[0][sent], t_s[1][read]), c, q, None if acting is None else acting[sent])
+        acts = None if acting is None else acting[sent]
+        part = respond((t_s[0][sent], t_s[1][read]), c, q, acts, _CLOCK_LAGS_S)
         if part is None:
             continue
         for k, joint in enumerate(joints):
-            # A motion that repeats fits at many lags: take the one next to that of the part before.
+            # A motion that repeats fits at many lags: take one next to that of the part before, if it fits.
             known = lags[np.isfinite(lags[:, k]), k]
             last, r = known[-1] if len(known) else lag_s[joint], part.r[:, k, k]
             best = int(np.argmax(r if last is None else np.where(np.abs(part.lag_s - last) < 0.15, r, -1.0)))
+            best = best if r[best] > 0.9 else int(np.argmax(r))
             if r[best] > 0.9 and min(s[k] for s in part.spread) > _STILL:
                 lags[row, k], curves[row, k] = part.lag_s[best], (part.lag_s, r)
     # One rate for all joints, each of which has a lag of its own.
@@ -356,25 +381,60 @@ def _clock(
         np.mean([1 - np.interp(lag, *curves[at]) for at, lag in zip(known, x, strict=True)]) for x in (found, usual)
     )
     grown = rate * (end - begin)
-    period_s = max(float(np.median(np.diff(t))) for t in t_s)
-    if abs(grown) < max(0.02, period_s) or rest.std() > 0.15 * abs(grown) or fixed < 1.5 * best + 1e-4:
+    least = max(0.02, *(float(np.median(np.diff(t))) for t in t_s))
+    if fixed < 1.5 * best + 1e-4:
         return []
-    text = (
-        f"the lag of positions behind goals grows by {1e3 * rate:.1f} ms each second ({1e3 * grown:.0f} ms in all): "
-        "the clocks of the two streams run at different rates"
-    )
+    if abs(grown) >= least and rest.std() <= 0.15 * abs(grown):
+        text = (
+            f"the lag of positions behind goals grows by {1e3 * rate:.1f} ms each second ({1e3 * grown:.0f} ms in all):"
+            " the clocks of the two streams run at different rates"
+        )
+    else:
+        # Or it steps once.
+        sides = [(found[rows < m], found[rows >= m], m) for m in range(1, count)]
+        fitting = [(float(np.var(a) * a.size + np.var(b) * b.size), m) for a, b, m in sides if a.size and b.size]
+        if not fitting:
+            return []
+        error, m = min(fitting)
+        grown = float(np.median(found[rows >= m]) - np.median(found[rows < m]))
+        if abs(grown) < 1.5 * least or np.sqrt(error / found.size) > 0.25 * abs(grown):
+            return []
+        text = (
+            f"the lag of positions behind goals changes by {1e3 * grown:.0f} ms about {parts[m][0] - t_s[1][0]:.0f} s "
+            "after the start: one of the two clocks was set"
+        )
     # The lag of a servo also changes with the frequency of a sweep, by less.
     return [Check("clock", -1, text, "refuse" if abs(grown) > 0.15 else "warn")]
 
 
+def _apart(t_s: tuple[np.ndarray, np.ndarray], goal: np.ndarray, position: np.ndarray) -> list[Check]:
+    """Return a finding if positions follow their goals at a lag that no robot has: the clocks are set apart."""
+    span_s = min(_APART_S, 0.4 * (min(t[-1] for t in t_s) - max(t[0] for t in t_s)))
+    found = respond(t_s, goal, position, lags_s=(-span_s, span_s))
+    if found is None or span_s < 2 * _LAGS_S[1]:
+        return []
+    r = np.diagonal(found.r, axis1=1, axis2=2).mean(axis=1)
+    k, robots = int(np.argmax(r)), (found.lag_s >= _LAGS_S[0]) & (found.lag_s <= _LAGS_S[1])
+    if r[k] < 0.9 or r[robots].max() > _FOLLOWS_R:
+        return []
+    text = (
+        f"positions follow their goals {found.lag_s[k]:.3g} s later (r {r[k]:.2f}): the two clocks are set apart, by "
+        "that less the robot's own lag"
+    )
+    return [Check("overlap", -1, text, "refuse")]
+
+
 def _zero(
-    t_s: tuple[np.ndarray, np.ndarray], goal: np.ndarray, position: np.ndarray, i: int, name: str, lag_s: float | None
-) -> list[Check]:
+    t_s: tuple[np.ndarray, np.ndarray], goal: np.ndarray, position: np.ndarray, i: int, name: str,
+    lag_s: float | None, unit: str,
+) -> list[Check]:  # fmt: skip
     """Return findings on a zero that steps, or an offset between goal and position.
 
     Args:
         lag_s: By how much the position follows its goal [s]; None if it does not: then only steps are looked for.
+        unit: Unit of both.
     """
+    one = 0.1 if unit == "m" else 1.0  # what a radian is to a hinge, 0.1 m is to a slide
     grid, held, joined, _ = _on_grid(t_s, goal[:, None], position[:, None], None)
     n, period_s = len(grid), float(grid[1] - grid[0])
     # Predict the position from the last goals; the rest shows the zero.
@@ -412,11 +472,13 @@ def _zero(
     for chosen in (steps, steps[:1]):
         sizes, rest = fitted(chosen)
         blocks = np.array([b.mean() for b in np.array_split(rest, max(8, int(np.ptp(at) / 1.0)))])
-        least = max(0.03, 5.0 * float(blocks.std()))
+        least = max(0.03 * one, 5.0 * float(blocks.std()))
         moved = sorted((k, float(size)) for k, size in zip(chosen, sizes, strict=True) if abs(size) > least)
         if moved and rest.std() <= 0.8 * first:
-            leaps = any(abs(size) > 0.1 and 0.6 < (q[k] - q[k - 1]) / size < 1.6 for k, size in moved)
-            listed = ", ".join(f"{size:+.3f} rad from {at[k] - t_s[1][0]:.2f} s on" for k, size in moved)
+            leaps = any(abs(size) > 0.1 * one and 0.6 < (q[k] - q[k - 1]) / size < 1.6 for k, size in moved)
+            listed = ", ".join(
+                f"{size:+.3f} {unit}".rstrip() + f" from {at[k] - t_s[1][0]:.2f} s on" for k, size in moved
+            )
             text = f"{name} reads against its goal {listed}: one of them has another zero"
             return [Check("zero", i, text, "refuse" if leaps else "warn")]
     if lag_s is None:
@@ -424,9 +486,10 @@ def _zero(
     shift = max(round(lag_s / period_s), 0)
     error = joined[shift:, 0] - held[: n - shift, 0]
     offset = float(np.median(error))
-    if abs(offset) > 0.05 and abs(offset) > 2.0 * float(np.median(np.abs(error - offset))):
-        text = f"{name} reads {offset:+.3f} rad against its goal on average: zeros differ, or a load pulls"
-        return [Check("offset", i, text, "ask" if abs(offset) > 1.0 else "warn")]
+    if abs(offset) > 0.05 * one and abs(offset) > 2.0 * float(np.median(np.abs(error - offset))):
+        size = f"{offset:+.3f} {unit}".rstrip()
+        text = f"{name} reads {size} against its goal on average: zeros differ, or a load pulls"
+        return [Check("offset", i, text, "ask" if abs(offset) > one else "warn")]
     return []
 
 
@@ -459,7 +522,9 @@ def _rate(t_s: np.ndarray, values: np.ndarray) -> float:
     steps = np.diff(t_s[new]) if len(new) > 20 else np.diff(t_s)
     usual = float(np.median(steps))
     regular = len(new) > 20 and np.mean(np.abs(steps - usual) < 0.2 * usual) > 0.8
-    return 1.0 / max(usual if regular else float(np.median(np.diff(t_s))), 1e-9)
+    steps = np.diff(t_s)
+    rest = steps[steps <= 10 * np.median(steps)]  # without pauses
+    return 1.0 / max(usual if regular else float(rest.mean()), 1e-9)
 
 
 def odd_columns(position: np.ndarray, names: Sequence[str]) -> list[Check]:
@@ -472,6 +537,22 @@ def odd_columns(position: np.ndarray, names: Sequence[str]) -> list[Check]:
         if others.size and size > 1.0 and size > 8.0 * others.max() and net < 0.7 * np.ptp(position[:, i]):
             text = f"{names[i]} reads up to {size:.4g}, the other joints {others.max():.3g}: another unit or scale?"
             findings.append(Check("scale", i, text, "refuse" if size > TURN_RAD else "warn"))
+    return findings
+
+
+def beyond(position: np.ndarray, names: Sequence[str], ranges: Mapping[str, tuple[float, float]]) -> list[Check]:
+    """Return a check on each joint that is outside of its range in the model for most of the time.
+
+    Args:
+        ranges: Joint -> lowest and highest position [rad or m].
+    """
+    findings = []
+    for i, name in enumerate(names):
+        low, high = ranges.get(name, (-np.inf, np.inf))
+        middle, spare = float(np.median(position[:, i])), 0.05 * min(high - low, 1.0)
+        if not low - spare <= middle <= high + spare:
+            text = f"{name} reads {middle:.3g} most of the time, its range in the model is {low:.3g} to {high:.3g}"
+            findings.append(Check("range", i, f"{text}: another order, sign, unit or zero?", "warn"))
     return findings
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +72,7 @@ class ImportHints:
         joints: Names of the robot's joints, in its order; empty if unknown.
         as_told: Keep names, order, signs and units, even if they are ambiguous or contradict the data.
         slides: Names of the sliding joints, whose positions are lengths.
+        ranges: Joint -> lowest and highest position in the model [rad or m].
         unit: Unit of positions and goals in the file; empty: by their names.
         calibration: LeRobot's calibration of the arm.
     """
@@ -81,6 +82,7 @@ class ImportHints:
     joints: tuple[str, ...] = ()
     as_told: bool = False
     slides: tuple[str, ...] = ()
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     unit: str = ""
     calibration: Path | None = None
 
@@ -189,7 +191,10 @@ class Proposal:
             for node, counts in source["dropped"].items():
                 self.evidence += [f"{node}: left out {n} samples: {why}" for why, n in counts.items()]
             self.evidence += [f"turns of {field} are counted" for field in source["turns"]]
-            self.weigh(checks.check_episode(episode, self.joints, by_name), unproven or ("actuator", "goal"))
+            read = episode.outputs["sensor"]["position"].reshape(-1, len(self.joints))
+            found = checks.check_episode(episode, self.joints, by_name)
+            found += checks.beyond(read, self.joints, self.hints.ranges)
+            self.weigh(found, unproven or ("actuator", "goal"))
 
     # -- positions, commands, and their joints
 

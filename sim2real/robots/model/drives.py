@@ -46,6 +46,11 @@ def slides_of(model: MjModel, joints: Sequence[str]) -> tuple[str, ...]:
     return tuple(j for j in joints if int(model.joint(j).type[0]) == int(mj.mjtJoint.mjJNT_SLIDE))
 
 
+def ranges_of(model: MjModel, joints: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """Return the ranges of those of a model's joints that have one [rad or m]."""
+    return {j: tuple(model.joint(j).range) for j in joints if model.jnt_limited[model.joint(j).id]}
+
+
 def unit_for(unit: str, slide: bool) -> str:
     """Return the unit of a hinge's quantity, or what takes its place at a slide."""
     return _OF_SLIDES.get(unit, unit) if slide else unit

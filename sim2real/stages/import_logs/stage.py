@@ -16,7 +16,7 @@ from sim2real.log.importing import checks, importer
 from sim2real.log.importing.mapping import MAPPING, ImportMapping, load_mapping
 from sim2real.log.importing.propose import ImportHints, Proposal
 from sim2real.log.importing.readers import Table, joined, open_tables
-from sim2real.robots.model.drives import joints_of, slides_of
+from sim2real.robots.model.drives import joints_of, ranges_of, slides_of
 from sim2real.robots.model.file import read_model
 from sim2real.robots.model.robot import MjcfRobot
 from sim2real.stages.import_logs.config import ImportConfig
@@ -136,7 +136,7 @@ def hints_of_model(
     if unknown := [j for j in joints if j not in every]:
         raise UsageError(f"{mjcf} has no joint {unknown[0]!r}. Available: {', '.join(every)}")
     chosen = joints or every
-    return ImportHints(name, rate_hz, chosen, slides=slides_of(model, chosen), **more)
+    return ImportHints(name, rate_hz, chosen, slides=slides_of(model, chosen), ranges=ranges_of(model, chosen), **more)
 
 
 def pipeline_name(path: Path) -> str:
