@@ -27,18 +27,19 @@ def manifest_of(folder):
 def make_bundle(name, folder, bias=0.0, slope=0.0):
     """Write a bundle whose policy gives the same action always, or one that grows with the third observation."""
     robot = load_robot(name)
-    size, low, high = (
-        observation_size(robot.task.observation),
-        *np.array([(a.low, a.high) for a in robot.task.action]).T,
-    )
-    weights = {"mean": np.zeros(size), "std": np.ones(size), "low": low, "high": high, "log_std": np.zeros(len(low))}
-    kernel = np.zeros((size, len(low)))
-    kernel[2] = slope
     trained = {"round_trip_delay": (0.043, 0.047)} if name == "pendulum" else {}
     terms = robot.task.observation, robot.task.action, robot.drive.rate_hz
     contract = PolicyContract(*terms, trained_s=trained, limits=dict(robot.task.limits))
-    layers = {"layers.0.kernel": kernel, "layers.0.bias": np.full(len(low), bias)}
-    return save_bundle(folder / "bundle", weights | layers, contract)
+    return save_bundle(folder / "bundle", linear(contract, bias, slope), contract)
+
+
+def linear(contract, bias=0.0, slope=0.0):
+    """Return the weights of such a policy."""
+    size, low, high = observation_size(contract.observation), *np.array([(a.low, a.high) for a in contract.action]).T
+    weights = {"mean": np.zeros(size), "std": np.ones(size), "low": low, "high": high, "log_std": np.zeros(len(low))}
+    kernel = np.zeros((size, len(low)))
+    kernel[2] = slope
+    return weights | {"layers.0.kernel": kernel, "layers.0.bias": np.full(len(low), bias)}
 
 
 def assert_torque_ends_off(truth):

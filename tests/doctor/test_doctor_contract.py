@@ -222,6 +222,8 @@ def test_placeholders_are_no_gains(value: str, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="placeholder"):
         read_policy(policy, out=tmp_path)
     assert "# kp = " in (tmp_path / "contract.toml").read_text()
+    small = written(tmp_path, METADATA | {"joint_stiffness": "1.500", "step_dt": "0.02"})
+    assert read_policy(small, out=tmp_path).contract.per_joint("kp").tolist() == [1.5] * 4
 
 
 LAB = """

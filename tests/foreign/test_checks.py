@@ -26,6 +26,20 @@ def test_a_short_recording_is_checked_too(count):
     assert {f[2] for f in findings(GOAL[:count], Q[:count], T[:count], T[:count])} <= {"warn", "ask"}
 
 
+def test_goals_while_nothing_acts_are_not_compared():
+    acting = T > 6.0
+    goal = np.where(acting[:, None], GOAL, 5.0)
+    assert [f for f in checks.check((T, T), goal, Q, NAMES, True, acting) if f.weight == "refuse"] == []
+    found = checks.check((T, T), goal * [1, -1, 1], Q, NAMES, True, acting)
+    assert [(f.name, f.joint) for f in found if f.weight == "refuse"] == [("sign", 1)]
+
+
+@pytest.mark.parametrize(("factor", "known"), [(1.0, True), (57.3, False), (0.5, False), (-1.0, False), (0.0, False)])
+def test_velocities_are_the_rate_of_positions_in_the_same_unit(factor, known):
+    assert checks.is_rate(T, Q, factor * np.gradient(Q, T, axis=0)) is known
+    assert checks.is_rate(T[:49], Q[:49], np.gradient(Q, T, axis=0)[:49]) is False
+
+
 def test_joints_that_follow_other_goals_are_refused():
     assert findings(GOAL[:, [1, 0, 2]]) == [("order", 0, "refuse"), ("order", 1, "refuse")]
 

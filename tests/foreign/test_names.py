@@ -9,7 +9,7 @@ from foreign_robots import MODEL, VENDOR, csv, imported, motion, proposed
 from sim2real import cli
 from sim2real.errors import UsageError
 from sim2real.log import import_file, load_mapping, read_log
-from sim2real.log.importing.names import columns_of, meaning
+from sim2real.log.importing.names import are_numbers, columns_of, meaning
 from sim2real.log.importing.propose import ImportHints, propose
 from sim2real.log.importing.readers import joined, open_tables
 
@@ -27,7 +27,9 @@ def table(path, goal="goal_{}_rad", q="q_{}_rad", stamps="t_s", factor=1.0, **mo
 @pytest.mark.parametrize("degrees", [0.9, 20.0, 500.0])
 def test_a_unit_that_no_name_has_is_asked_however_small_or_large_the_motion(tmp_path, degrees):
     path = table(tmp_path, "goal_{}", "q_{}", factor=degrees)
-    assert {key for _, _, key in proposed(path).questions} == {"unit"}
+    questions = proposed(path).questions
+    assert {key for _, _, key in questions} == {"unit"}
+    assert all('"rad" or "deg"' in text for text in questions.values())
     episode, _ = imported(path, unit="deg")
     np.testing.assert_allclose(episode.outputs["sensor"]["position"], np.radians(degrees * Q), atol=1e-6)
 
@@ -114,6 +116,14 @@ def test_columns_of_a_floating_base_before_those_of_the_joints_are_asked(tmp_pat
     (tmp_path / "import.toml").write_text(answered)
     episode = import_file(tmp_path / "run.npz", tmp_path / "import.toml")
     np.testing.assert_array_equal(episode.outputs["sensor"]["position"], Q)
+
+
+@pytest.mark.parametrize(
+    ("labels", "numbers"),
+    [("3 4", True), ("m_3 m_4", True), ("m3 m12", True), ("a_1 b_2", False), ("hip 3", False), ("hip knee", False)],
+)
+def test_numbers_are_no_names(labels, numbers):
+    assert are_numbers(labels.split()) is numbers
 
 
 @pytest.mark.parametrize("nameless", [False, True])

@@ -44,6 +44,9 @@ def test_of_many_parts_one_that_stands_out_does_not_decide():
     found = judged([part(str(i), e, e) for i, e in enumerate(errors)])
     assert found.expected_of(JOINT.name).error == pytest.approx(1.25 * np.quantile([*errors, 0.01], 0.9))
     assert found.errors[0].expected < 1.25 * 0.03
+    few = [part(str(i), e, e) for i, e in enumerate(errors[-9:])]
+    assert judged(few[:-1]).expected_of(JOINT.name).error == pytest.approx(1.25 * errors[-2])
+    assert judged(few).expected_of(JOINT.name).error < 1.25 * 0.03, "of ten, the end of the log is one"
     diverged = judged([part(str(i), e, np.inf if i == 3 else e) for i, e in enumerate(errors)])
     assert diverged.expected_of(JOINT.name, free_run=True) is None
 
@@ -94,7 +97,15 @@ def motion(low, high, speed):
         (motion(-0.5, 0.5, 6.0), 3.0),
         (motion(-1.0, 2.0, 2.0), 1.5),
         (motion(-1.0, 1.0, 90.0), 4.0),
+        (motion(-1.0, 30.0, 2.0), 1.0 + (2 * np.pi - 2.0) / 2.0),  # after a whole turn a hinge has been everywhere
     ],
 )
 def test_the_motion_of_a_single_joint_widens_it(later, factor):
     assert wider_for(motion(-1.0, 1.0, 2.0), later, [JOINT]) == {"pan": pytest.approx(factor)}
+    moved = {JOINT.name: (later[JOINT.name][0] + 5.0, later[JOINT.name][1] + 5.0, later[JOINT.name][2])}
+    assert wider_for(motion(4.0, 6.0, 2.0), moved, [JOINT]) == {"pan": pytest.approx(factor)}, "wherever zero is"
+
+
+@pytest.mark.parametrize(("before", "now", "factor"), [(0.5, 1.5, 3.0), (0.0, 1.5, 1.0)])
+def test_how_much_faster_a_slow_joint_moves(before, now, factor):
+    assert wider_for(motion(-1.0, 1.0, before), motion(-1.0, 1.0, now), [JOINT]) == {"pan": pytest.approx(factor)}

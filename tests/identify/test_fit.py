@@ -93,13 +93,6 @@ def test_from_where_another_fit_ended_only_the_last_refinement_is_made(episode, 
     assert result.values["gain"] == pytest.approx(GAIN, rel=0.01)
 
 
-def test_what_nothing_determines_stays_near_its_nominal_value(episode):
-    """Commands of one sign and size tell the gain and the bias only together."""
-    still = replace(episode, outputs={**episode.outputs, "actuator": {"u": np.full(len(episode.steps["sensor"]), 0.5)}})
-    result = fit(Problem(Model(), [still], spans(0), LENGTH_S, CONFIG, TABLE))
-    assert "not determined" in result.uncertainty().verdict
-
-
 def test_the_first_part_of_a_segment_is_simulated_but_not_compared(episode):
     everything, rest = (Problem(Model(), [episode], spans(0), LENGTH_S, replace(CONFIG, skip_s=s)) for s in (0.0, 0.4))
     np.testing.assert_array_equal(rest.ts, np.where(everything.ts < 0.4, -1.0, everything.ts))

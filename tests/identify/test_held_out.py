@@ -14,7 +14,8 @@ from sim2real.identification import held_out
 from sim2real.identification.fit import fit, refine, refit
 from sim2real.identification.held_out import Fold, folds_of, leave_out, moving
 from sim2real.identification.model import Channel
-from sim2real.identification.residuals import Problem
+from sim2real.identification.parameters import Parameter, ParameterTable
+from sim2real.identification.residuals import Linearised, Problem
 from sim2real.identification.segments import Span
 
 
@@ -65,12 +66,36 @@ def test_blocks_cover_the_log_without_overlap(one):
     assert all(a[1] == pytest.approx(b[0]) for a, b in pairwise(ends))
     masks = np.array([p.touches(spans(0), LENGTH_S) for p in one.parts])
     assert masks.any(axis=0).all()
+    with pytest.raises(UsageError, match="cannot be divided into 40 parts"):
+        folds_of(one.fit.problem, 40)
 
 
 def test_a_model_that_is_right_leaves_the_noise(one):
     for row in one.rows:
         assert row.ahead["y"] == pytest.approx(NOISE, rel=0.25)
         assert row.free["y"] == pytest.approx(NOISE, rel=0.25)
+    assert sum(row.share["gain"] for row in one.rows) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("present", [[True], [False]])
+def test_a_part_that_is_left_out_of_a_linear_model_has_the_error_of_a_refit(present):
+    """Against numpy: each part's mean square at the least squares of all others."""
+    table = ParameterTable(
+        [
+            Parameter("gain", "1", 0.0, -1e4, 1e4, "linear"),
+            Parameter("bias", "1", 0.0, -1e4, 1e4, "linear", term="bias"),
+        ]
+    )
+    rng, at = np.random.default_rng(0), np.array([0.3, -0.2])
+    J, noise = rng.normal(size=(6, 40, 1, 2)), rng.normal(size=(6, 40, 1))
+    r = J @ (at - [1.0, 0.5]) + noise
+    parts = np.repeat(np.eye(3, dtype=bool), 2, axis=1)
+    stats = held_out.statistics(None, Linearised(r, J, 1e-12 * np.eye(2), at, r), parts)
+    found = held_out.on_held_out_parts(stats, table, np.array(present))
+    columns, y = slice(0, 2 if present[0] else 1), (J @ at)[..., 0] - r[..., 0]
+    for k, part in enumerate(parts):
+        best = np.linalg.lstsq(J[~part][..., 0, columns].reshape(-1, columns.stop), y[~part].ravel(), rcond=None)[0]
+        assert found[k] == pytest.approx(np.mean((J[part][..., 0, columns] @ best - y[part]) ** 2), rel=1e-6)
 
 
 def test_errors_are_of_parts_in_which_the_joint_moves():
@@ -123,14 +148,10 @@ def test_groups_of_parts_cover_all_of_them_and_few_parts_stay_alone():
     assert of.tolist() == list(range(held_out.MOST))
 
 
-def test_recordings_of_one_name_go_together(three):
+def test_recordings_of_one_name_go_together_and_too_few_are_divided_into_blocks(three):
     whole, _ = three
     found = folds_of(whole.problem, 5, ["slow", "fast", "slow"])
     assert found == [Fold("slow", ((0, 0.0, np.inf), (2, 0.0, np.inf))), Fold("fast", ((1, 0.0, np.inf),))]
-
-
-def test_too_few_recordings_are_divided_into_blocks(three):
-    whole, _ = three
     for names, least in ((["a", "b", "c"], 4), (["all", "all", "all"], 2)):
         found = folds_of(whole.problem, 5, names, least)
         assert len(found) == 6  # two of each recording: five at least
@@ -156,8 +177,3 @@ def test_blocks_begin_where_segments_may(count, blocks, begin_s):
     touched = sum(f.touches(begun, 0.7).astype(int) for f in found)
     apart = np.min(np.abs(inner[:, None] - [s.begin_s for s in begun]), axis=1)
     assert touched.sum() == count + np.sum(apart > 1e-6)
-
-
-def test_too_little_to_leave_out_is_refused(one):
-    with pytest.raises(UsageError, match="cannot be divided into 40 parts"):
-        folds_of(one.fit.problem, 40)

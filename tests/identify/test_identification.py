@@ -18,23 +18,14 @@ def round_trip(values):
     return values["sensor_delay"] + values["actuator_delay"]
 
 
-@pytest.mark.parametrize("group", ["gain", "gravity", "damping", "friction"])
-def test_groups_are_recovered(fitted, group):
-    assert fitted.values[group] == pytest.approx(fitted.truth[group], rel=0.03)
-
-
-def test_round_trip_is_recovered(fitted):
-    assert round_trip(fitted.values) == pytest.approx(round_trip(fitted.truth), abs=0.001)
-
-
-@pytest.mark.night
-def test_how_the_delay_is_shared_between_both_sides_of_the_world_changes_little(fitted):
-    table = fitted.problem.table.with_fixed({"sensor_delay": 0.012})
-    values = {**fitted.values, "sensor_delay": 0.012, "actuator_delay": fitted.values["actuator_delay"] - 0.012}
-    problem = Problem(fitted.problem.model, [fitted.episode], fitted.problem.spans, 1.3, fitted.problem.config, table)
-    best, worse = (fitted.loss(fitted.problem.table.encode(v)) for v in (
-        fitted.values, {**fitted.values, "actuator_delay": fitted.values["actuator_delay"] + 0.004}))  # fmt: skip
-    assert abs(problem.loss(table.encode(values)) - best) < 0.2 * (worse - best)
+def test_truth_is_recovered_and_the_interval_of_the_round_trip_covers_it(fitted):
+    found, truth, spread = fitted.values, fitted.truth, fitted.spread
+    for name in ("gain", "gravity", "damping", "friction"):
+        assert found[name] == pytest.approx(truth[name], rel=0.03)
+    assert spread.verdict == ("ok",) * 5
+    error = spread.standard_error[list(fitted.problem.table.names).index("actuator_delay")]
+    assert error < 0.002
+    assert round_trip(found) == pytest.approx(round_trip(truth), abs=min(0.001, 1.96 * error))
 
 
 def test_the_nominal_model_without_delays_is_much_worse(fitted):
@@ -65,14 +56,6 @@ def check_measurements(fitted, columns):
     assert columns["held_out"].any()
     per_segment = np.bincount(columns["segment"])
     assert per_segment.min() > 0.8 * problem.segment_s * 50
-
-
-def test_the_interval_of_the_round_trip_covers_the_truth(fitted):
-    spread, names = fitted.spread, list(fitted.problem.table.names)
-    assert spread.verdict == ("ok",) * 5
-    error = spread.standard_error[names.index("actuator_delay")]
-    assert abs(round_trip(fitted.values) - round_trip(fitted.truth)) < 1.96 * error
-    assert error < 0.002
 
 
 @pytest.mark.parametrize(("node", "field"), [("sensor", "th"), ("sensor", "thdot"), ("actuator", "action")])

@@ -34,11 +34,6 @@ def test_a_loss_in_plain_python():
     assert found.parameters["x"] == pytest.approx(3.0, abs=0.02)
 
 
-def test_a_start_that_is_best_stays():
-    found = minimise(lambda p: jnp.abs(p["x"]), {"x": 0.0}, {"x": (-1.0, 1.0)}, FitConfig(population=4, generations=1))
-    assert (float(found.parameters["x"]), found.loss) == (0.0, 0.0)
-
-
 @pytest.mark.parametrize(
     ("parameters", "bounds", "said"),
     [

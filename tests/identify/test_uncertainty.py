@@ -148,44 +148,12 @@ def test_an_estimate_at_a_bound_is_told():
         found = from_linearised(stub(table), at)
         assert found.verdict == (verdict,)
         assert -1.0 <= found.low[0] < found.high[0] <= 1.0
-
-
-def test_what_lies_at_a_narrow_bound_is_no_less_at_a_bound_for_being_vague():
+    # However a robust loss tames what is far off: 10 deviations are 10.
+    assert from_linearised(stub(table), replace(at, raw=np.full_like(noise, 10.0))).misfit == pytest.approx(10.0)
+    # Being vague makes it no less at a bound.
     table = ParameterTable([Parameter("a", "1", 0.0, -0.1, 0.1, "linear")])
-    noise = np.random.default_rng(0).normal(size=(2, 10, 1))
-    at = Linearised(noise, np.ones((2, 10, 1, 1)), np.diag(12.0 / table.span**2), np.array([0.1]), noise)
+    at = Linearised(noise, 0.3 * np.ones((10, 50, 1, 1)), np.diag(12.0 / table.span**2), np.array([0.1]), noise)
     assert from_linearised(stub(table), at).verdict == ("at a bound",)
-
-
-@pytest.fixture
-def delayed():
-    """A gain and two delays of which the residuals know the sum alone."""
-    table = ParameterTable(
-        [
-            Parameter("gain", "1", 0.0, -WIDE, WIDE, "linear"),
-            Parameter("late", "s", 0.0, 0.0, 0.06, "linear", "delay", side="measurement"),
-            Parameter("early", "s", 0.0, 0.0, 0.05, "linear", "delay", side="command"),
-        ]
-    )
-    rng = np.random.default_rng(0)
-    gain, delay = rng.normal(size=(2, 20, 60, 1))
-    X = np.stack([gain, 100.0 * delay, 100.0 * delay], axis=-1)
-    r = rng.normal(size=gain.shape)
-    at = Linearised(r, X, np.diag(12.0 / table.span**2), np.array([1.0, 0.02, 0.025]), r)
-    return SimpleNamespace(table=table, at=at, X=X)
-
-
-def test_the_misfit_counts_every_deviation(delayed):
-    """However a robust loss tames what is far off: 10 deviations are 10."""
-    at = replace(delayed.at, raw=np.where(delayed.at.residuals != 0.0, 10.0, 0.0))
-    assert from_linearised(stub(delayed.table), at).misfit == pytest.approx(10.0)
-
-
-def test_with_one_delay_fixed_the_other_is_known(delayed):
-    one = delayed.table.with_fixed({"early": 0.0})
-    r = delayed.at.residuals
-    at = Linearised(r, delayed.X[..., :2], np.diag(12.0 / one.span**2), delayed.at.x[:2], r)
-    assert from_linearised(stub(one, "free"), at).verdict == ("ok", "ok")
 
 
 def test_an_inverse_of_what_doubles_do_not_resolve_has_no_negative_variances():

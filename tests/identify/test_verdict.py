@@ -1,5 +1,6 @@
 """The verdict: one of four, why, and the way out; it speaks for every position."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -59,16 +60,21 @@ def test_accepted():
     assert reason == "th is off by 100 mrad 1 s ahead on held-out parts; the best baseline, standing still, by 400 mrad"
 
 
-@pytest.mark.parametrize("own", [0.96, 1.0, 3.0, np.nan, np.inf])
-def test_no_improvement(own):
-    found = judge(rows(own, 5.0, goal=1.0) if own < 4 else rows(own, 1.0))
-    assert found.status == "change the model"
-    assert ("no better than goal (1 rad)" if own < 4 else "no better than nominal (1 rad)") in found.reasons[0]
-
-
-@pytest.mark.parametrize("diverged", [np.nan, np.inf])
-def test_a_baseline_that_diverges_is_no_better(diverged):
-    assert judge(rows(0.1, diverged)).status == "accepted"
+@pytest.mark.parametrize(
+    ("errors", "named"),
+    [
+        *((rows(own, 5.0, goal=1.0), "no better than goal (1 rad)") for own in (0.96, 1.0, 3.0)),
+        *((rows(own, 1.0), "no better than nominal (1 rad)") for own in (np.nan, np.inf)),
+        *((rows(0.1, diverged), "") for diverged in (np.nan, np.inf)),
+        (rows(0.17, 1.0, **{"without delays": 0.1}), ""),  # a rough fit without delays decides nothing
+        (rows(0.1, 1.0, **{"without delays": 0.1}), "needs none"),
+        ([], "no part was held out"),
+    ],
+)
+def test_a_model_must_be_better_than_every_baseline(errors, named):
+    found = judge(errors)
+    assert found.status == ("change the model" if "no better" in named else "accepted")
+    assert any(named in reason for reason in found.reasons)
 
 
 GOOD = {"identified": 0.01, "without delays": 0.05, "nominal": 0.2, "standing still": 0.4, "goal": 0.1}
@@ -87,6 +93,8 @@ def test_the_worst_position_comes_first_and_all_are_told():
     found = judge(both(GOOD, GOOD | {"identified": 0.04}))
     assert [r.split(" ")[0] for r in found.reasons] == ["tilt", "pan"]
     assert "the best baseline, goal, by 100 mrad" in found.reasons[0]
+    many = [Position(f"q[{i}]", f"joint {i}", "rad", 1e-6) for i in range(4)]
+    assert judge(ranked(dict.fromkeys(many, GOOD), 1.0)).reasons[-1] == "1 more joints improve at least as much"
     lost = judge(both(GOOD | {"identified": 50.0}, GOOD))
     assert lost.reasons[0].startswith("pan ")
     assert lost.reasons[0].endswith("nominal (200 mrad), standing still (400 mrad), goal (100 mrad)")
@@ -97,13 +105,6 @@ def test_a_joint_that_stood_still_cannot_be_predicted_better_than_its_noise():
     assert judge(both(GOOD, still)).status == "accepted"
     drifts = still | {"identified": 0.02}
     assert judge(both(GOOD, drifts)).status == "change the model"
-
-
-def test_a_rough_fit_without_delays_decides_nothing():
-    assert judge(rows(0.17, 1.0, **{"without delays": 0.1})).status == "accepted"
-    found = judge(rows(0.1, 1.0, **{"without delays": 0.1}))
-    assert found.status == "accepted"
-    assert any("needs none" in r for r in found.reasons)
 
 
 @pytest.mark.parametrize(
@@ -158,17 +159,19 @@ def test_a_delay_whose_bounds_were_narrowed_gets_wider_ones():
     made = SimpleNamespace(verdict=tuple(verdicts))
     found = verdict.judge(rows(0.1, 1.0), narrow, x, made, check(), max_delay_s=0.06)
     assert found.next == "--bounds sensor_delay 0 0.02"
+    # The model's own longest delay is a flag, up to a second.
+    table = TABLE.with_fixed({"actuator_delay": 0.0})
+    for longest, flags in ((0.06, "--max-delay-s 0.12"), (0.9, "--max-delay-s 1"), (1.0, "")):
+        (late,) = [replace(p, high=longest) for p in table if p.name == "sensor_delay"]
+        assert verdict.way_out(late, upper=True, max_delay_s=longest) == flags
 
 
 def test_what_nothing_determines_is_not_helped_by_other_bounds():
     found = judge(rows(0.1, 1.0), spread(gain="at a bound"), check(("gain",)), x=TABLE.high)
     assert (found.status, found.next) == ("record again", "")
-
-
-def test_not_identifiable():
-    found = judge(rows(0.1, 1.0), check=check(("gain",)))
+    found = judge(rows(0.1, 1.0), check=check(("gain",)), doubts=["damping is held"])
     assert found.status == "record again"
-    assert "nothing in this data determines gain" in found.reasons
+    assert {"nothing in this data determines gain", "damping is held"} <= {*found.reasons}
 
 
 def test_the_first_that_applies_is_the_status_and_all_are_reasons():
@@ -177,16 +180,6 @@ def test_the_first_that_applies_is_the_status_and_all_are_reasons():
     assert found.status == "change the model"
     assert len(found.reasons) == 3
     assert judge(rows(0.1, 1.0), bound, check(("offset",)), x=x).status == "change the model"
-
-
-def test_nothing_held_out_is_told():
-    found = judge([])
-    assert found.reasons == ("no part was held out: the error of its predictions is unknown",)
-
-
-def test_extrapolation_is_said():
-    found = judge(rows(0.1, 1.0), doubts=["damping is held"])
-    assert "damping is held" in found.reasons
 
 
 def test_a_term_that_halves_the_error_comes_before_a_parameter_that_nothing_determines():

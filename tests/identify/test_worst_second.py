@@ -63,11 +63,6 @@ def test_a_series_shorter_than_a_second_is_one_window():
     assert worst_window(np.array([0.0, 0.1]), np.array([1.0, 9.0])) == (0.0, 0.1, pytest.approx(math.sqrt(5.0)))
 
 
-def test_its_line_has_joint_time_and_error():
-    worst, _ = worst_second(samples((pulse(3.0, 0.2), still)), (LARGE, SMALL), 0.3, LOGS)
-    assert str(worst) == f"joint hip, {worst.begin_s:.1f} s of a.mcap, {1e3 * worst.error:.0f} mrad"
-
-
 @pytest.mark.parametrize(
     ("value", "unit", "text"),
     [

@@ -7,11 +7,8 @@ import numpy as np
 import pytest
 
 import sim2real
-from sim2real.artifacts.bundle import Bundle
-from sim2real.artifacts.deployment import Deployment
 from sim2real.artifacts.identification import Estimate, Identification, Judgement
 from sim2real.artifacts.recording import Recording
-from sim2real.artifacts.timing import Timing
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.episode import Episode, Steps
 from sim2real.stages.config import DeployConfig, IdentifyConfig, TrainConfig
@@ -80,20 +77,3 @@ def test_a_dict_of_what_is_different_is_a_configuration(pendulum):
     assert arguments.config_of(None, pendulum.defaults.train) is pendulum.defaults.train
     with pytest.raises(UsageError):
         arguments.config_of({"held_out": 2.0, "log": ()}, pendulum.defaults.identify)
-
-
-@pytest.mark.parametrize("kind", [str, Path])
-def test_artifacts_are_saved_and_loaded_by_any_path(kind, tmp_path):
-    folder = kind(tmp_path / "new" / "folder")
-    FOUND.save(folder)
-    assert Identification.load(folder).values == {"gain": 21.0494}
-    assert arguments.identification_of(folder).values == {"gain": 21.0494}
-    with pytest.raises(Sim2RealError, match="there is no log"):
-        Recording.load(kind(tmp_path / "none.mcap"))
-    (tmp_path / "run" / "record").mkdir(parents=True)
-    with pytest.raises(Sim2RealError) as caught:
-        Recording.load(kind(tmp_path / "run"))
-    assert "run/record" in caught.value.hint
-    for load in (Bundle.load, Deployment.load, Timing.load):
-        with pytest.raises(Sim2RealError):
-            load(kind(tmp_path / "none"))

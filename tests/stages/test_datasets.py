@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from sim2real.artifacts.recording import Recording
-from sim2real.log import read_log
 from sim2real.stages.identify.stage import identify
 from sim2real.stages.load import load_robot
 
@@ -21,15 +20,6 @@ def test_the_logs_are_those_of_the_manifest():
     assert found == set(MANIFEST)
     for name, entry in MANIFEST.items():
         assert hashlib.sha256((DATASETS / entry["pipeline"] / name).read_bytes()).hexdigest() == entry["sha256"]
-    assert sum(entry["bytes"] for entry in MANIFEST.values()) < 3_000_000
-
-
-@pytest.mark.parametrize("name", MANIFEST)
-def test_the_log_is_complete(name):
-    episode = read_log(DATASETS / MANIFEST[name]["pipeline"] / name)
-    assert episode.complete
-    assert episode.metadata["pipeline"] == MANIFEST[name]["pipeline"]
-    assert abs(episode.duration_s - MANIFEST[name]["duration_s"]) < 0.1
 
 
 @pytest.mark.night  # `make test` finds true parameters in test_any_robot.py, and those of real logs in test_disk.py

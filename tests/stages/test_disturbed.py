@@ -26,13 +26,8 @@ def prepared():
     return prepared
 
 
-@pytest.fixture(scope="module")
-def made(prepared):
-    vary = {"uniform": 0.2, "push": 3.0, "push_hz": 1.5, "start_position": 0.3, "curriculum": (0.1, 0.5)}
-    return prepared(**vary)
-
-
-def test_what_is_shown_is_what_is_drawn_at_the_end_of_the_training(made):
+def test_what_is_shown_is_what_is_drawn_at_the_end_of_the_training(prepared):
+    made = prepared(uniform=0.2, push=3.0, push_hz=1.5, start_position=0.3, curriculum=(0.1, 0.5))
     rows = {row[0]: row for row in made.episodes.rows().rows}
     assert set(rows) == {"gain", "gravity", "damping", "friction", "start position", "push"}
     draws = made.episodes.draws
@@ -43,12 +38,8 @@ def test_what_is_shown_is_what_is_drawn_at_the_end_of_the_training(made):
     told = disturbance_rows(made.episodes)
     assert told["pushes"] == "1.5 a second for each joint"
     assert told["curriculum"] == "0.1 of these differences at the first update, 0.5 at the last one"
-
-
-def test_the_environment_has_what_is_shown(made):
-    assert made.env.curriculum == (0.1, 0.5)
-    assert made.env.pushes.sizes == (3.0,)
-    assert made.env.task.start == (0.3, 0.0)
+    env = made.env
+    assert (env.curriculum, env.pushes.sizes, env.task.start) == ((0.1, 0.5), (3.0,), (0.3, 0.0))
 
 
 def test_a_curriculum_of_nothing_is_refused(prepared):

@@ -52,11 +52,6 @@ def test_the_command_is_what_was_sent_and_the_rest_is_the_supervisors(states):
     assert sorted(found) == sorted(names), "what the agent wanted is not what was sent: it is left out"
 
 
-def test_the_arms_score_reads_them(states):
-    _, t_s, found = states
-    assert set(ARM.task.score(t_s, found)) == {"success", "reached", "distance_m", "first_reached_s"}
-
-
 def test_a_deployment_on_a_machine_that_was_too_busy_is_reported_without_a_simulation(capsys, monkeypatch):
     slow = steps(50)
     busy = Steps(**{**vars(slow), "end": slow.start + 100_000})

@@ -54,6 +54,9 @@ def test_estimates_that_differ_between_parts_widen_the_interval_to_the_jackknife
     assert found.standard_error[0] == pytest.approx(reach, rel=0.01)
     assert found.high[0] - 1.0 == pytest.approx(1.96 * reach, rel=0.01)
     assert found.scale_covariance[0, 0] == pytest.approx(reach**2, rel=0.02)
+    far = widened(known.spread, known.table, known.at, [left(str(k), 1.0 + k) for k in range(5)])
+    assert far.verdict == ("not determined",)
+    assert far.low[0] >= 0.0
 
 
 @pytest.mark.parametrize(
@@ -86,48 +89,35 @@ def test_what_one_part_alone_determines_widens_as_the_others():
     assert found.standard_error[1] == pytest.approx(found.standard_error[0])
 
 
-def test_a_wider_interval_may_no_longer_be_accepted(known):
-    far = widened(known.spread, known.table, known.at, [left(str(k), 1.0 + k) for k in range(5)])
-    assert far.verdict == ("not determined",)
-    assert far.low[0] >= 0.0
+TERMS = ParameterTable(
+    [
+        Parameter("gain", "1", 1.0, 0.5, 2.0),
+        Parameter("cogging", "1", 0.1, -1.0, 1.0, "linear", term="cogging"),
+        Parameter("swing", "1", 0.1, -1.0, 1.0, "linear", term="swing", off=0.0),
+        Parameter("bias", "1", 0.2, -1.0, 1.0, "linear", term="bias"),
+    ]
+)
 
 
-def test_the_flag_says_which_terms_are_there():
-    table = ParameterTable(
-        [
-            Parameter("gain", "1", 1.0, 0.5, 2.0),
-            Parameter("cogging", "1", 0.0, -1.0, 1.0, "linear", term="cogging"),
-            Parameter("bias", "1", 0.0, -1.0, 1.0, "linear", free=False, term="bias"),
-        ]
-    )
-    assert with_wanted_terms(table, "own") is table
-    assert with_wanted_terms(table, "auto").terms == with_wanted_terms(table, "all").terms == ("cogging", "bias")
-    assert with_wanted_terms(table, "none").terms == ()
-    assert with_wanted_terms(table, "bias, cogging").terms == ("cogging", "bias")
+def test_the_flag_says_which_terms_are_there_and_holds_a_value_in_whichever():
+    assert with_wanted_terms(TERMS, "own") is TERMS
+    every = ("cogging", "swing", "bias")
+    assert with_wanted_terms(TERMS, "auto").terms == with_wanted_terms(TERMS, "all").terms == every
+    assert with_wanted_terms(TERMS, "none").terms == ()
+    assert with_wanted_terms(TERMS, "bias, cogging").terms == ("cogging", "bias")
     with pytest.raises(UsageError, match="unknown term 'drag'"):
-        with_wanted_terms(table, "drag")
+        with_wanted_terms(TERMS, "drag")
     with pytest.raises(UsageError, match="no optional terms"):
-        with_wanted_terms(ParameterTable([table["gain"]]), "auto")
+        with_wanted_terms(ParameterTable([TERMS["gain"]]), "auto")
+    model = SimpleNamespace(parameters=TERMS, reached=lambda _: {})
+    fewer = table_of(model, IdentifyConfig(terms="cogging", fix={"swing": 0.3}), [])
+    assert fewer.terms == ("cogging",)
+    assert {p.name: (p.nominal, p.free) for p in fewer} == {
+        "gain": (1.0, True), "cogging": (0.1, True), "swing": (0.3, False), "bias": (0.2, False),
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize("options", [{"folds": 1}, {"folds": -1}, {"folds": 0, "terms": "auto"}])
 def test_folds_that_leave_nothing_to_compare_are_refused(options):
     with pytest.raises(UsageError, match="folds must be 0, or 2 and more"):
         IdentifyConfig(**options)
-
-
-def test_terms_that_are_not_named_are_off_and_a_flag_holds_a_value_in_whichever_term():
-    table = ParameterTable(
-        [
-            Parameter("gain", "1", 1.0, 0.5, 2.0),
-            Parameter("cogging", "1", 0.1, -1.0, 1.0, "linear", term="cogging"),
-            Parameter("swing", "1", 0.1, -1.0, 1.0, "linear", term="swing", off=0.0),
-            Parameter("bias", "1", 0.2, -1.0, 1.0, "linear", term="bias"),
-        ]
-    )
-    model = SimpleNamespace(parameters=table, reached=lambda _: {})
-    fewer = table_of(model, IdentifyConfig(terms="cogging", fix={"swing": 0.3}), [])
-    assert fewer.terms == ("cogging",)
-    assert {p.name: (p.nominal, p.free) for p in fewer} == {
-        "gain": (1.0, True), "cogging": (0.1, True), "swing": (0.3, False), "bias": (0.2, False),
-    }  # fmt: skip

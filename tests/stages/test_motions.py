@@ -1,13 +1,11 @@
 """``record --excitation FILE`` plays a motion within the robot's limits, and ``--excitation hand`` records one."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from sim2real import cli
-from sim2real.artifacts.run import newest
 from sim2real.errors import UsageError
 from sim2real.log.reader import read_log
 from sim2real.stages.load import load_module, load_robot
@@ -36,8 +34,7 @@ def write(path, pose, order=range(6), unit="deg"):
 
 def goals(path, **settings):
     config = replace(ARM.defaults.record, excitation=str(path), **settings)
-    robot = ARM
-    return played(config, robot, announce=True) + robot.drive.centre
+    return played(config, ARM, announce=True) + ARM.drive.centre
 
 
 def at_the_robots_rate(pose):
@@ -50,36 +47,9 @@ def test_columns_are_found_by_joint_in_any_order_and_unit(tmp_path, unit):
     path = write(tmp_path / "motion.csv", wave(), order=[3, 0, 5, 1, 2, 4], unit=unit)
     np.testing.assert_allclose(goals(path), at_the_robots_rate(wave()), atol=1e-6)
     assert len(goals(path, duration_s=2.0)) == 100
-
-
-def test_goals_of_a_teleoperation_come_before_measurements(tmp_path):
-    path = tmp_path / "teleoperated.npz"
-    names = np.array(SERVOS.names)
-    np.savez(path, t_s=T_S, names=names, position_rad=0.5 * wave(), goal_rad=wave())
-    np.testing.assert_allclose(goals(path), at_the_robots_rate(wave()), atol=1e-6)
-    np.savez(path, t_s=T_S, names=names, position_rad=wave(0.5))
-    np.testing.assert_allclose(goals(path), at_the_robots_rate(wave(0.5)), atol=1e-6)
-
-
-def test_an_episode_of_a_lerobot_data_set_is_a_motion(tmp_path):
-    pyarrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
-    folder = tmp_path / "data" / "chunk-000"
-    folder.mkdir(parents=True)
-    (tmp_path / "meta").mkdir()
-    names = [f"{name}.pos_deg" for name in SERVOS.names]
-    features = {key: {"dtype": "float32", "shape": [6], "names": names} for key in ("action", "observation.state")}
-    info = {"codebase_version": "v2.1", "fps": 30, "robot_type": "so101_follower", "features": features}
-    (tmp_path / "meta" / "info.json").write_text(json.dumps(info))
-    columns = {
-        "action": list(np.rad2deg(wave()).astype(np.float32)),
-        "observation.state": list(np.rad2deg(wave(0.7)).astype(np.float32)),
-        "timestamp": (np.arange(len(T_S)) / 30).astype(np.float32),
-        "frame_index": np.arange(len(T_S)),
-        "episode_index": np.zeros(len(T_S), np.int64),
-    }
-    parquet.write_table(pyarrow.table(columns), folder / "episode_000000.parquet")
-    rows = goals(folder / "episode_000000.parquet")
-    np.testing.assert_allclose(rows, at_the_robots_rate(wave())[: len(rows)], atol=1e-4)
+    taught = tmp_path / "teleoperated.npz"  # goals come before measurements
+    np.savez(taught, t_s=T_S, names=np.array(SERVOS.names), position_rad=0.5 * wave(), goal_rad=wave())
+    np.testing.assert_allclose(goals(taught), at_the_robots_rate(wave()), atol=1e-6)
 
 
 def test_the_ends_outside_of_the_limits_are_not_played(tmp_path, capsys):
@@ -126,20 +96,6 @@ def test_files_without_a_motion_are_refused(tmp_path):
         goals(write(tmp_path / "short.csv", wave()[:20]))
     with pytest.raises(UsageError, match="neither multisine, chirp, steps, hand nor standing, nor a file"):
         replace(ARM.defaults.record, excitation="wobble")
-
-
-@pytest.mark.night  # an arm plays one below
-def test_a_recorded_motion_of_the_pendulum_is_checked_and_played(tmp_path, capsys):
-    t_s = np.arange(0.0, 3.0, 0.02)
-    volts = 1.2 * np.sin(2 * np.pi * 0.7 * t_s)
-    np.savetxt(tmp_path / "v.csv", np.column_stack([t_s, volts]), delimiter=",", header="t_s,command", comments="")
-    runs = ["--runs", str(tmp_path / "runs")]
-    assert cli.main(["record", "pendulum", "--excitation", str(tmp_path / "v.csv"), *runs]) == 0
-    assert "motion: command of v.csv, 3.0 s" in capsys.readouterr().err
-    log = read_log(newest(tmp_path / "runs", "pendulum", "record").output("log"))
-    sent = log.outputs["agent"]["command"].ravel()
-    np.testing.assert_allclose(sent, volts[: len(sent)], atol=1e-6)
-    assert log.duration_s == pytest.approx(3.0, abs=0.05)
 
 
 def test_a_log_is_a_motion_that_the_arm_reaches_slowly(tmp_path):

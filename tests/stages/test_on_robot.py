@@ -13,7 +13,6 @@ from live_robots import assert_torque_ends_off, make_bundle, manifest_of
 
 import sim2real
 from sim2real import cli, errors
-from sim2real.artifacts.recording import Recording
 from sim2real.emulation.truth import Kind, read_truth
 from sim2real.hardware.device import OperatingMode
 from sim2real.log.reader import read_log
@@ -22,7 +21,6 @@ from sim2real.stages.deploy import episodes, stage
 from sim2real.stages.load import load_module, load_robot
 from sim2real.stages.session import episode
 from sim2real.stages.session.excitation import played
-from sim2real.view.timing import parts_of
 
 
 @pytest.fixture
@@ -62,15 +60,6 @@ def test_strict_timing_ends_with_its_code_and_a_complete_log(tmp_path, clocks, m
     assert episode.metadata["log"]["session_end"]["timing"]["agent"]["overruns"] == 4
     assert (folder / "timing.json").is_file()
     assert_torque_ends_off(read_truth(folder / "truth.bin"))
-
-
-def test_an_embedded_robot_does_the_same_each_time(tmp_path):
-    first, second = (call(tmp_path / name, "record", "arm", "--duration-s", 2)[2] for name in "ab")
-    assert (first / "truth.bin").read_bytes() == (second / "truth.bin").read_bytes()
-    once, again = (read_log(folder / "session.mcap") for folder in (first, second))
-    for name, steps in once.steps.items():
-        assert len(steps) == 100
-        np.testing.assert_array_equal(steps.start, again.steps[name].start)
 
 
 def test_a_dry_run_sends_nothing_that_moves_and_is_no_recording(tmp_path):
@@ -152,14 +141,6 @@ def test_what_this_robot_cannot_do_is_refused(tmp_path):
     code, _, folder = deploy(tmp_path, "pendulum", bundle, "--hold")
     assert code == errors.USAGE
     assert manifest_of(folder)["status"] == "failed"
-
-
-def test_a_recording_knows_the_shares_of_host_and_bus_in_the_delay(tmp_path):
-    _, _, folder = call(tmp_path, "record", "pendulum", "--duration-s", 2)
-    parts = {name: (where, counted) for name, where, _, counted in parts_of(Recording.load(folder / "session.mcap"))}
-    assert parts["sensor on the bus, question and answer"] == ("bus", False)
-    assert parts["actuator on the bus"] == ("bus", True)
-    assert {where for where, _ in parts.values()} == {"host", "bus"}
 
 
 def test_a_recording_by_hand_has_no_command_and_no_torque(tmp_path):

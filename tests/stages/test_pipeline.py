@@ -32,16 +32,9 @@ def test_a_folder_beside_the_user_is_a_pipeline(tmp_path, monkeypatch):
     assert "found_here" not in available()
     monkeypatch.chdir(tmp_path)
     assert {"found_here", "pendulum"} <= set(available())
-    assert load_robot("found_here").units == {"about": "robot"}
-    assert load_robot("found_here") is load_robot("found_here")
-
-
-def test_the_robot_is_an_object_of_its_module(tmp_path, monkeypatch):
-    write(tmp_path, "one_object")
-    monkeypatch.chdir(tmp_path)
-    robot = load_robot("one_object")
-    assert robot is load_module("one_object", "robot").ROBOT
-    assert (robot.name, robot.folder) == ("one_object", tmp_path / "pipelines" / "one_object")
+    robot = load_robot("found_here")
+    assert robot is load_robot("found_here") is load_module("found_here", "robot").ROBOT
+    assert (robot.name, robot.folder) == ("found_here", tmp_path / "pipelines" / "found_here")
 
 
 @pytest.mark.parametrize(
@@ -109,9 +102,3 @@ def test_a_robot_of_ones_own_goes_by_the_name_of_its_class():
     assert robot_of(disk) is robot_of("disk") is disk
     own = robot_of(type("Spare", (type(disk),), {})())
     assert (own.name, own.folder, defaults_of(own)) == ("Spare", None, Defaults())
-
-
-@pytest.mark.parametrize("robot", [None, 3])
-def test_what_is_no_robot_is_refused(robot):
-    with pytest.raises(UsageError, match=rf"{robot!r} is no robot"):
-        robot_of(robot)

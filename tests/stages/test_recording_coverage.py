@@ -16,12 +16,6 @@ def test_gaps_are_counted_and_the_longest_is_told():
     assert sampling(np.array([1.0])) == (0, 0.0, 0.0)
 
 
-def test_both_directions():
-    moving, forward = motion_of(T, np.cos(2 * np.pi * 0.5 * T))
-    assert moving > 0.9
-    assert forward == pytest.approx(0.5, abs=0.01)
-
-
 def test_speed_of_a_position_survives_equal_stamps():
     assert speed(T, 3.0 * T)[100] == pytest.approx(3.0)
     t = T.copy()

@@ -43,7 +43,4 @@ def test_units_come_from_the_channels_and_of_older_logs_from_the_session(pendulu
 def test_a_log_in_other_units_is_refused(pendulum, units, metadata, said):
     with pytest.raises(Sim2RealError, match=f"{said}(.|\n)*scale"):
         require_units(recording(units, metadata), pendulum)
-
-
-def test_what_neither_knows_is_let_through(pendulum):
     require_units(recording({"sensor": {"th": "rad", "temperature": "K"}, "camera": {"th": "px"}}), pendulum)

@@ -10,6 +10,7 @@ import pytest
 from sim2real import cli
 from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.run import open_stage
+from sim2real.commands import flags
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.stages.load import defaults_of
 from sim2real.stages.train import stage
@@ -63,28 +64,19 @@ def test_the_policy_of_a_resumed_training_is_the_uninterrupted_ones(runs, tmp_pa
     np.testing.assert_allclose(sum(terms), found.history.returns, rtol=1e-4)
 
 
-def settings(own, target, **changes):
-    from sim2real.commands import flags
-    from sim2real.stages.load import defaults_of
-
-    words = [*TINY[2:], "--resume", str(target)]
-    words += [word for name, value in changes.items() for word in (f"--{name}", value)]
-    config = defaults_of("pendulum").train
-    return flags.parse(config, words, "")
-
-
 @pytest.mark.night
 def test_what_cannot_be_resumed_is_refused(runs, tmp_path):
     own, whole = folder(runs), folder(runs / "whole")
+    resumed = lambda target: flags.parse(defaults_of("pendulum").train, [*TINY[2:], "--resume", str(target)], "")  # noqa: E731
     with pytest.raises(UsageError, match="is a training of pendulum, not of arm"):
-        stage.find_interrupted("arm", settings(own, own), runs)
+        find_interrupted("arm", resumed(own), runs)
     with pytest.raises(UsageError, match="there is no interrupted training of 'pendulum'"):
-        stage.find_interrupted("pendulum", settings(own, whole), runs)
+        find_interrupted("pendulum", resumed(whole), runs)
     early = tmp_path / "train"
     early.mkdir()
     shutil.copy(own / "manifest.json", early)
     with pytest.raises(Sim2RealError, match="interrupted before its first evaluation"):
-        stage.find_interrupted("pendulum", settings(own, early), runs)
+        find_interrupted("pendulum", resumed(early), runs)
 
 
 def test_what_cannot_be_swept_is_refused_at_once(capsys):

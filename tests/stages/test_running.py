@@ -26,14 +26,6 @@ def world(tmp_path, monkeypatch):
     return stages
 
 
-def test_without_the_flag_a_run_goes_around_once(world):
-    again, rows = world.go(verdict("re-identify"), iterations=1)
-    assert again == []
-    assert [row.verdict for row in rows] == ["re-identify"]
-    (folder,) = (world.root / "pendulum").iterdir()
-    assert iterations_sections(folder) == []
-
-
 def test_a_fine_robot_ends_the_loop(world, capsys):
     again, rows = world.go(verdict("re-train", 0.6), verdict("fine", 1.0))
     assert again == ["train", "deploy"]
@@ -81,6 +73,8 @@ def test_a_robot_that_became_later_is_recorded_and_trained_for_anew(world):
 
 
 def test_the_loop_ends_as_a_deployment_does_that_is_refused_to_the_end(world):
+    with pytest.raises(UsageError, match="at least once"):
+        RunFlags(iterations=0)
     with pytest.raises(DelayChanged):
         world.go(LATER, iterations=1)
     with pytest.raises(DelayChanged):
@@ -92,11 +86,6 @@ def test_what_nobody_can_mend_unattended_ends_the_loop(world, status, capsys):
     again, (row,) = world.go(verdict(status, reason="it is loose"))
     assert (again, row.why) == ([], "it is loose")
     assert "stop: it is loose" in capsys.readouterr().err
-
-
-def test_a_number_of_iterations_that_is_none_is_refused():
-    with pytest.raises(UsageError, match="at least once"):
-        RunFlags(iterations=0)
 
 
 def test_a_deployment_that_does_not_say_what_it_took_is_not_repeated_for_ever(world, monkeypatch):

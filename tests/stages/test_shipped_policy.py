@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import jax
 import pytest
 
-from sim2real.commands.loop import run_all, why_shipped
+from sim2real.commands.loop import run_all
 from sim2real.commands.stages import RunFlags
 from sim2real.errors import UsageError
 from sim2real.stages.load import defaults_of, load_robot
@@ -41,7 +41,3 @@ def test_with_a_gpu_a_policy_is_trained_on_the_identification(go, monkeypatch):
     assert list(called) == ["record", "identify", "train", "deploy"]
     assert called["train"].model == "identified"
     assert defaults_of("go2").train.model == "nominal"
-
-
-def test_a_robot_that_a_processor_trains_is_trained():
-    assert why_shipped(load_robot("pendulum")) == ""

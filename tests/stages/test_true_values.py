@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from sim2real.artifacts.identification import Estimate, Identification, Judgement
 from sim2real.emulation.truth import Kind, TruthLog, read_truth
 from sim2real.graph.episode import Steps
+from sim2real.stages.identify.stage import show
 from sim2real.stages.identify.true_values import sensing_delay_s
 
 MS = 1_000_000
@@ -27,3 +29,13 @@ def test_the_sample_is_the_one_that_was_read(tmp_path, servo_ids, way_ns):
     steps = Steps(stamps, stamps, stamps, np.full(20, -1), stamps + 100, np.zeros(20, np.int64))
     found = sensing_delay_s(read_truth(tmp_path / "truth.bin"), steps, 0)
     assert found == pytest.approx((AGE_NS + way_ns) * 1e-9, abs=2e-6)
+
+
+@pytest.mark.parametrize(
+    ("estimate", "truth", "off"), [(1.1, 1.0, "+10.0 %"), (0.004, 0.0, "+0.004 kg"), (0.0, 0.0, "+0 kg")]
+)
+def test_how_far_an_estimate_is_off_where_nothing_is_true_too(estimate, truth, off, capsys):
+    """An empty hand holds 0 kg."""
+    p = Estimate("payload", "kg", "dynamics", "", 0.0, estimate, "accepted", truth=truth)
+    show(Identification("arm", (), Judgement("accepted", ()), (p,)))
+    assert off in capsys.readouterr().out

@@ -55,15 +55,6 @@ def test_a_resumed_run_is_complete(finished_run_dir):
     assert log == {"path": "record/session.mcap", "sha256": recorded["sha256"]}
 
 
-@pytest.mark.night
-def test_resuming_a_finished_run_does_nothing(run_copy, capsys):
-    before = {stage: manifest_of(run_copy / stage)["started"] for stage in STAGES}
-    root = run_copy.parent.parent
-    assert cli.main(["run", "pendulum", "--resume", str(run_copy), "--runs", str(root)]) == 0
-    assert capsys.readouterr().err.count("finished before, skipped") == 4
-    assert before == {stage: manifest_of(run_copy / stage)["started"] for stage in STAGES}
-
-
 @pytest.mark.night  # `make test` moves a run folder in test_run_folder.py
 def test_a_run_that_was_copied_goes_on_without_its_origin(finished_run_dir, tmp_path, monkeypatch):
     """Neither the log nor anything outside of the run folder is needed to train, deploy, report and look at it."""
@@ -160,9 +151,3 @@ def test_commands_about_runs_are_functions_too(run_copy, tmp_path):
     assert scored.identified == run.identification.verdict.status
     with pytest.raises(UsageError, match="which these parameters were identified from"):
         sim2real.validate("pendulum", run_copy / "identify", run.recording)
-
-
-@pytest.mark.parametrize("command", ["info", "report"])
-def test_a_finished_run_can_be_looked_at(run_copy, command, capsys):
-    assert cli.main([command, str(run_copy)]) == 0
-    assert capsys.readouterr().out
