@@ -8,7 +8,7 @@ import random
 import re
 import typing
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -33,23 +33,8 @@ from sim2real.robots.model.parameters import ParameterPattern
 from sim2real.robots.model.robot import RobotConfig
 
 FILES = (Deployment, Episodes, History, Identification, Sensitivity, Timing)
-ODD = [
-    "\U0001f600",
-    "\x7f",
-    "\x00",
-    '"""',
-    "a\n[[terms]]",
-    "\u2028",
-    "",
-    "\\",
-    "'",
-    "#",
-    "nan",
-    "inf",
-    "null",
-    "\ufffe",
-    "a.b",
-]
+ODD = ["\U0001f600", "\x7f", "\x00", '"""', "a\n[[terms]]", "\u2028", "", "\\", "'", "#", "nan", "inf", "null"]
+ODD += ["\ufffe", "a.b"]
 BESIDE = ("recordings", "simulated", "probe", "samples", "free", "timing")
 """Fields that lie in files of their own."""
 SQUARE = {History: ("returns", "success")}
@@ -105,13 +90,9 @@ def plainly(value: typing.Any) -> typing.Any:
     def without_nan(v: typing.Any) -> typing.Any:
         if isinstance(v, dict):
             return {k: without_nan(x) for k, x in v.items()}
-        return (
-            [without_nan(x) for x in v]
-            if isinstance(v, list | tuple)
-            else None
-            if v in (math.inf, -math.inf) or v != v
-            else v
-        )
+        if isinstance(v, list | tuple):
+            return [without_nan(x) for x in v]
+        return None if v in (math.inf, -math.inf) or v != v else v
 
     return without_nan(value)
 
@@ -167,19 +148,6 @@ def test_manifests(tmp_path, seed):
     assert plain(StageFolder.read(tmp_path).manifest) == plain(written)
 
 
-def test_a_document_without_infinity_reads_as_before(tmp_path):
-    (tmp_path / "x.json").write_text('{"parameter": null, "of": [1.0, null]}')
-    assert read_json(tmp_path / "x.json", Old) == Old(None, (1.0, None))
-
-
-@dataclasses.dataclass
-class Old:
-    """A file that was written before."""
-
-    parameter: float | None
-    of: tuple[float | None, ...]
-
-
 POSTERIOR = Posterior(("gain",), ("log",), np.zeros(1), np.eye(1), -np.ones(1), np.ones(1))
 COLUMNS = {n: np.ones(4) * i for i, n in enumerate(("t", "into", "segment", "recording", "held_out", "th_measured"))}
 NODE = NodeTiming(2, Spread(0.02, 0.02, 0.021), NONE, Spread(0.001, 0.002, 0.003), {"sensor": NONE}, 1)
@@ -206,31 +174,11 @@ DRAWN = Episodes(
 )
 
 
-def same(a, b):
-    """Return whether two values are the same, where a file has null for what is infinite or no number."""
-    if is_dataclass(a):
-        return all(same(getattr(a, f.name), getattr(b, f.name)) for f in fields(a))
-    if isinstance(a, dict | tuple):
-        pairs = zip(a.values(), b.values(), strict=True) if isinstance(a, dict) else zip(a, b, strict=True)
-        return len(a) == len(b) and all(same(x, y) for x, y in pairs)
-    if isinstance(a, np.ndarray):
-        return np.array_equal(np.where(np.isfinite(a), a, np.nan), b, equal_nan=True)
-    return b is None if isinstance(a, float) and not np.isfinite(a) else a == b
-
-
 @pytest.mark.parametrize("artifact", [IDENTIFIED, TIMED, DRAWN, replace(IDENTIFIED, samples={}, free={})])
 def test_a_folder_gives_back_what_was_saved(artifact, tmp_path):
     written = artifact.save(tmp_path)
     assert {f.name for f in tmp_path.iterdir()} == set(written.values())
-    assert same(artifact, type(artifact).load(tmp_path))
-
-
-@pytest.mark.parametrize(("is_open", "last"), [(True, ("unit", "")), (False, ("95 % drawn", "unit"))])
-def test_a_table_of_episodes_has_a_column_for_open_parameters_where_there_are_some(is_open, last):
-    parameter = replace(DRAWN.parameters[0], open=is_open)
-    table = replace(DRAWN, parameters=(parameter,)).rows()
-    assert table.headers[-2:] == last
-    assert len(table.rows[0]) == len(table.headers)
+    assert plainly(type(artifact).load(tmp_path)) == plainly(artifact)
 
 
 def test_the_worst_joint_has_the_largest_share_of_its_expected_error():
@@ -251,6 +199,7 @@ def test_the_next_command_names_the_run_in_which_the_file_lies(tmp_path):
     assert Identification.load(after / "identify").verdict.next == f"sim2real train pendulum --run {after}"
 
 
+NO_NOISE = {"field": "q", "unit": "", "deviation": 0, "resolution": 0, "offset": 0}
 DAMAGE = [
     (IDENTIFIED, "parameters.json", {"format": 2}, "format 2"),
     (IDENTIFIED, "parameters.json", {"parameters": [{"name": "gain"}]}, "parameters"),
@@ -260,25 +209,13 @@ DAMAGE = [
     (TIMED, "timing.json", {"nodes": {}}, "nodes"),
     (DRAWN, "episodes.json", {"format": 99}, "format 99"),
     (DRAWN, "episodes.json", {"parameters": []}, "other parameters"),
-    (
-        DRAWN,
-        "episodes.json",
-        {"noise": [{"field": "q", "unit": "", "deviation": -1, "resolution": 0, "offset": 0}]},
-        "q",
-    ),
-]
-DAMAGE_OF_POSTERIORS = [
-    ({"mean": "much"}, "convert"),
-    ({"covariance": [[1.0, 0.0], [0.0]]}, "inhomogeneous"),
-    ({"names": None}, "array"),
-    ({"lower": [0.0, 1.0]}, "sizes"),
-    ({"transform": ["cubic"]}, "cubic"),
-    ({"mean": [None]}, "number"),
-]
-DAMAGE += [
-    (IDENTIFIED, "parameters.json", {"posterior": {**plain(POSTERIOR), **change}}, word)
-    for change, word in DAMAGE_OF_POSTERIORS
-]
+    *((DRAWN, "episodes.json", {"noise": [{**NO_NOISE, **bad}]},
+       "q") for bad in ({"deviation": -1}, {"offset": -1}, {"resolution": -1})),
+    *((IDENTIFIED, "parameters.json", {"posterior": {**plain(POSTERIOR), **change}}, word) for change, word in (
+        ({"mean": "much"}, "convert"), ({"covariance": [[1.0, 0.0], [0.0]]}, "inhomogeneous"),
+        ({"names": None}, "array"), ({"lower": [0.0, 1.0]}, "sizes"),
+        ({"transform": ["cubic"]}, "cubic"), ({"mean": [None]}, "number"))),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("artifact", "file", "change", "word"), DAMAGE)
@@ -307,14 +244,13 @@ def test_arrays_that_do_not_belong_to_the_document_are_refused(artifact, tmp_pat
         type(artifact).load(tmp_path)
 
 
-@pytest.mark.parametrize("kind", [Identification, Timing, Episodes])
 @pytest.mark.parametrize("content", [None, "", "{", "[]"])
-def test_a_missing_or_cut_file_is_refused(kind, content, tmp_path):
-    name = {Identification: "parameters.json", Timing: "timing.json", Episodes: "episodes.json"}[kind]
-    if content is not None:
-        (tmp_path / name).write_text(content)
-    with pytest.raises(Sim2RealError, match=name):
-        kind.load(tmp_path)
+def test_a_missing_or_cut_file_is_refused(content, tmp_path):
+    for kind, name in ((Identification, "parameters.json"), (Timing, "timing.json"), (Episodes, "episodes.json")):
+        if content is not None:
+            (tmp_path / name).write_text(content)
+        with pytest.raises(Sim2RealError, match=name):
+            kind.load(tmp_path)
 
 
 # -- TOML

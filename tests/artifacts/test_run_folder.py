@@ -6,7 +6,6 @@ import os
 import subprocess
 import sys
 import threading
-from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
@@ -14,7 +13,7 @@ import numpy as np
 import pytest
 
 from sim2real.artifacts import run as run_folder
-from sim2real.artifacts.run import Manifest, StageFolder, git_state, sha256, write_manifest
+from sim2real.artifacts.run import StageFolder, git_state, sha256
 from sim2real.commands import info
 from sim2real.errors import SafetyStop, Sim2RealError, UsageError
 from sim2real.stages.config import RecordConfig, TrainConfig
@@ -154,16 +153,10 @@ def test_a_promised_output_that_is_missing_fails_the_stage(tmp_path):
 
     with pytest.raises(Sim2RealError, match=r"session\.mcap"):
         broken()
-    with pytest.raises(Sim2RealError, match="no finished 'record'"):
-        run_folder.newest(tmp_path, "pendulum", "record")
-
-
-def test_outputs_stay_in_the_stages_folder(tmp_path):
-    with (
-        run_folder.open_stage(tmp_path, "pendulum", "record", None) as stage,
-        pytest.raises(UsageError, match="must lie in"),
+    with pytest.raises(
+        Sim2RealError, match=r"no finished 'record' of pipeline 'pendulum'[\s\S]*sim2real record pendulum"
     ):
-        stage.output("log", "../log.mcap")
+        run_folder.newest(tmp_path, "pendulum", "record")
 
 
 def test_missing_inputs_are_errors_before_a_folder_is_made(tmp_path):
@@ -173,14 +166,6 @@ def test_missing_inputs_are_errors_before_a_folder_is_made(tmp_path):
     ):
         pass
     assert not (tmp_path / "runs").exists()
-
-
-def test_a_stage_is_named_as_its_folder(tmp_path):
-    with (
-        pytest.raises(UsageError, match=r"'\.\./fly' is no name for a stage"),
-        run_folder.open_stage(tmp_path, "pendulum", "../fly", None),
-    ):
-        pass
 
 
 def test_run_names_are_unique_and_sort_by_age(tmp_path):
@@ -198,30 +183,6 @@ def test_newest_is_the_last_finished_one(tmp_path):
     assert run_folder.newest(tmp_path, "pendulum", "record", run_dir=first.run_dir).folder == first.folder
     again = record(tmp_path, run_dir=first.run_dir)
     assert run_folder.newest(tmp_path, "pendulum", "record").folder == again.folder
-
-
-def test_a_missing_artifact_is_named_with_the_command_that_makes_it(tmp_path):
-    with pytest.raises(Sim2RealError) as caught:
-        run_folder.newest(tmp_path, "pendulum", "identify")
-    assert "no finished 'identify' of pipeline 'pendulum'" in str(caught.value)
-    assert "sim2real identify pendulum" in str(caught.value)
-
-
-def test_running_a_stage_again_keeps_the_earlier_attempts(tmp_path):
-    first = record(tmp_path, text="1")
-    run_dir = first.run_dir
-    record(tmp_path, run_dir, text="2")
-    latest = record(tmp_path, run_dir, text="3")
-    assert latest.output("log").read_text() == "3"
-    assert [a.output("log").read_text() for a in run_folder.attempts(run_dir, "record")] == ["3", "2", "1"]
-    with (
-        pytest.raises(SafetyStop),
-        run_folder.open_stage(tmp_path, "pendulum", "record", None, run_dir=run_dir),
-    ):
-        raise SafetyStop("too fast")
-    found = run_folder.finished(run_dir, "record")
-    assert found is not None
-    assert found.output("log").read_text() == "3"
 
 
 def test_two_at_work_in_one_run_do_not_meet(tmp_path):
@@ -254,12 +215,15 @@ def test_what_refers_to_an_attempt_stays_right_when_the_stage_runs_again(tmp_pat
 
 @pytest.mark.parametrize("name", ["../../../etc", "..", "a/b", "", ".hidden", "/etc", "a\nb"])
 def test_names_that_lead_out_of_the_runs_folder(tmp_path, name):
-    with (
-        pytest.raises(UsageError, match="no name for a pipeline"),
-        run_folder.open_stage(tmp_path / "r", name, "record", None),
-    ):
-        pass
+    for names, said in (((name, "record"), "no name for a pipeline"), (("pendulum", name), "no name for a stage")):
+        with pytest.raises(UsageError, match=said), run_folder.open_stage(tmp_path / "r", *names, None):
+            pass
     assert not any(tmp_path.iterdir())
+    with (
+        run_folder.open_stage(tmp_path, "pendulum", "record", None) as stage,
+        pytest.raises(UsageError, match="must lie in"),
+    ):
+        stage.output("log", "../log.mcap")
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG])
@@ -295,14 +259,6 @@ def test_outputs_that_are_unknown_or_gone(tmp_path):
         done.output("log")
 
 
-def test_a_manifest_that_cannot_be_written_leaves_the_old_one(tmp_path):
-    manifest = Manifest("pendulum", "record", "running", "")
-    write_manifest(tmp_path, manifest)
-    with pytest.raises(TypeError):
-        write_manifest(tmp_path, replace(manifest, config=object()))
-    assert json.loads((tmp_path / "manifest.json").read_text())["config"] is None
-
-
 def test_hash_of_a_folder_depends_on_names_and_contents(tmp_path):
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / "f").write_text("1")
@@ -313,14 +269,11 @@ def test_hash_of_a_folder_depends_on_names_and_contents(tmp_path):
     assert sha256(tmp_path / "a") != sha256(tmp_path / "b")
 
 
-def test_no_git_state_outside_of_a_repository(tmp_path):
-    assert git_state(tmp_path) is None
-
-
 def test_the_git_state_is_the_commit_and_whether_tracked_files_differ(tmp_path):
     def git(*arguments):
         return subprocess.run(["git", *arguments], cwd=tmp_path, check=True, capture_output=True, text=True).stdout
 
+    assert git_state(tmp_path) is None, "it is no repository"
     git("init", "-q")
     assert git_state(tmp_path) is None, "there is no commit yet"
     (tmp_path / "f").write_text("1")
@@ -340,15 +293,13 @@ def test_a_clock_that_is_set_back_does_not_hide_the_newest_attempt(tmp_path, mon
         latest = record(tmp_path, first.run_dir, text=f"at {hour}")
     for number in range(4, 12):
         latest = record(tmp_path, first.run_dir, text=f"at 7, {number}")
-    assert [a.folder.name for a in run_folder.attempts(first.run_dir, "record")][:3] == [
-        "record.11", "record.10", "record.9",
-    ]  # fmt: skip
-    found = run_folder.finished(first.run_dir, "record")
-    assert found is not None
-    assert found.folder == latest.folder
+    attempts = run_folder.attempts(first.run_dir, "record")
+    assert [a.folder.name for a in attempts][:3] == ["record.11", "record.10", "record.9"]
+    assert [a.output("log").read_text() for a in attempts][-3:] == ["at 7", "at 9", "1"]
+    assert run_folder.finished(first.run_dir, "record").folder == latest.folder
 
 
-@pytest.mark.parametrize("number", [errno.EROFS, errno.EACCES, errno.EPERM])
+@pytest.mark.parametrize("number", [errno.EROFS, errno.EACCES])
 def test_a_folder_that_is_read_only_is_named_before_anything_moves(tmp_path, monkeypatch, number):
     """A process of root writes in spite of permissions, so the error is that of a file system."""
     first = record(tmp_path)

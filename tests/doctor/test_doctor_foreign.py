@@ -4,10 +4,10 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import made_bags as bags
 import mujoco
 import numpy as np
 import pytest
-from mcap_ros2.writer import Writer
 from test_doctor_contract import network
 
 from sim2real import cli
@@ -32,12 +32,6 @@ METADATA = {
     "observation_terms_history_length": "2.0,1.0,1.0,1.0", "observation_terms_scale": "1.0,0.1,1.0,1.0",
     "joint_stiffness": "40.000", "joint_damping": "1.200", "step_dt": "0.02", "delay_s": "0.008",
 }  # fmt: skip
-STATE = "float64[] position\nfloat64[] velocity\n"
-JOINT_STATE = f"Header header\nstring[] name\n{STATE}{'=' * 80}\nMSG: std_msgs/Header\ntime stamp\nstring frame_id\n"
-JOINT_STATE = JOINT_STATE.replace("Header header", "std_msgs/Header header").replace(
-    "time stamp", "builtin_interfaces/Time stamp"
-)
-JOINT_STATE += f"{'=' * 80}\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
 
 
 def deployed(folder: Path, fault: str) -> dict[str, np.ndarray]:
@@ -90,25 +84,21 @@ def as_csv(folder: Path, rows: dict[str, np.ndarray]) -> Path:
 def as_bag(folder: Path, rows: dict[str, np.ndarray]) -> Path:
     """Write a bag: joint states at 200 Hz in the vendor's order, the policy's topics at its rate."""
     steps = np.flatnonzero(np.append(True, (np.diff(rows["action"], axis=0) != 0.0).any(1)))
-    with (folder / "log.mcap").open("wb") as stream:
-        writer = Writer(stream)
-        states = writer.register_msgdef("sensor_msgs/msg/JointState", JOINT_STATE)
-        floats = writer.register_msgdef("std_msgs/msg/Float32MultiArray", "float32[] data\n")
+    made = []
 
-        def write(t: float, topic: str, message: dict, schema: object = floats) -> None:
-            writer.write_message(topic, schema, message, log_time=round(1e9 * t), publish_time=round(1e9 * t))
+    def add(t: float, topic: str, message: dict, kind: str = bags.NUMBERS) -> None:
+        made.append((topic, kind, message, round(1e9 * t)))
 
-        for k, now in enumerate(1.7e9 + rows["t"]):
-            head = {"stamp": {"sec": int(now), "nanosec": round(1e9 * (now % 1))}, "frame_id": ""}
-            state = {"position": rows["q"][k, ::-1].tolist(), "velocity": rows["dq"][k, ::-1].tolist()}
-            write(now, "/joint_states", {"header": head, "name": JOINTS[::-1], **state}, states)
-            if k in steps:
-                for late, name in ((1e-3, "observation"), (2e-3, "action"), (0.0, "command")):
-                    write(now + late, f"/policy/{name}", {"data": rows[name][k].tolist()})
-                goal = {"position": rows["target"][k].tolist(), "velocity": []}
-                write(now + 3e-3, "/joint_commands", {"header": head, "name": JOINTS, **goal}, states)
-        writer.finish()
-    return folder / "log.mcap"
+    for k, now in enumerate(1.7e9 + rows["t"]):
+        stamp = round(1e9 * now)
+        state = bags.state(rows["q"][k, ::-1], stamp, JOINTS[::-1])
+        add(now, "/joint_states", state | {"velocity": rows["dq"][k, ::-1].tolist()}, bags.STATE)
+        if k in steps:
+            for late, name in ((1e-3, "observation"), (2e-3, "action"), (0.0, "command")):
+                layout = {"dim": [], "data_offset": 0}
+                add(now + late, f"/policy/{name}", {"layout": layout, "data": rows[name][k].tolist()})
+            add(now + 3e-3, "/joint_commands", bags.state(rows["target"][k], stamp, JOINTS), bags.STATE)
+    return bags.write(folder / "log.mcap", made)
 
 
 @pytest.fixture(autouse=True)

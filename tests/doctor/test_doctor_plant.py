@@ -15,7 +15,6 @@ from sim2real.doctor.contract import Contract, Policy, Term, contract_toml
 from sim2real.doctor.diagnosis import diagnose, solve_timing
 from sim2real.doctor.log import read_deployment
 from sim2real.doctor.plant import Drives, driven_joints, solve_plant
-from sim2real.doctor.search import shortened
 from sim2real.doctor.solve import frozen_sensors
 
 XML = """<mujoco><option timestep="0.0025"/><worldbody><body>
@@ -112,11 +111,6 @@ def test_torque_at_the_limit_of_the_model_is_no_fault(tmp_path: Path) -> None:
     (tmp_path / "robot.xml").write_text(XML.replace("armature", 'actuatorfrcrange="-1.1 1.1" armature'))
     found, _ = solve_plant(Drives(tmp_path / "robot.xml", CONTRACT), log, CONTRACT)
     assert found == []
-
-
-def test_a_sentence_about_many_joints_names_two() -> None:
-    assert shortened(["a at 1 N m", "b at 2 N m"]) == "a at 1 N m, b at 2 N m"
-    assert shortened(list("abcdefghij")) == "a, b and 8 more"
 
 
 def test_another_rate_is_named(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from sim2real.artifacts.sensitivity import Moved, Sensitivity
 from sim2real.emulation.truth import Kind, TruthLog
 from sim2real.graph.episode import MessageRecord, StepRecord
 from sim2real.log.writer import McapRecorder
@@ -93,6 +94,10 @@ def entry(
 def parameters(truth: bool = True) -> dict[str, Any]:
     """Return parameters.json; ``truth``: with the true values, as of an emulated robot."""
     names = [EVIL, "friction", "sensor_delay"]
+    ranges = {"mean": (67, 65, 69), "deviation": (38, 36, 40), "p95": (126, 124, 128), "lost": (300, 200, 400)}
+    ends = ("value", "low95", "high95")
+    link = {n: dict(zip(ends, (1e-4 * v for v in of), strict=True)) for n, of in ranges.items()}
+    link |= {"delays": [0.004, 0.012], "share": [0.6, 0.4]}
     return {
         "format": 6,
         "pipeline": "pendulum",
@@ -119,18 +124,9 @@ def parameters(truth: bool = True) -> dict[str, Any]:
             "joint": "th", "field": "th", "unit": "rad", "log": "session.mcap", "begin_s": 3.0, "end_s": 3.98,
             "error": 0.01, "share_of_motion": 0.1,
         },
+        "links": [{"name": "sensor_delay + actuator_delay", **link}],
         "units": UNITS,
     }  # fmt: skip
-
-
-def over_logs() -> list[dict[str, Any]]:
-    """Return two parameters over three logs."""
-    rows = []
-    for name, unit, scale in (("friction", "rad/s^2", 8.5), ("round_trip_delay", "s", 0.045)):
-        ends = {"mean": scale, "standard_error": 0.01 * scale, "spread": 0.02 * scale}
-        ends |= {"low95": 0.8 * scale, "high95": 1.2 * scale}
-        rows.append({"name": name, "unit": unit, **ends})
-    return rows
 
 
 def predictions() -> dict[str, np.ndarray]:
@@ -197,6 +193,12 @@ def write_stage(run: Path, stage: str, folder: str | None = None, status: str = 
         np.savez(path / "free_runs.npz", **free_runs())
     elif stage == "train":
         (path / "history.json").write_text(json.dumps(history()))
+        multiples, success = (
+            np.array([-2.0, -1.0, 1.0, 2.0]),
+            {EVIL: (1.0, 1.0, 0.95, 0.9), "friction": (0.2, 0.9, 1, 1)},
+        )
+        moved = [Moved(n, "rad/s^2", 3.0, 0.25, 3.0 + 0.25 * multiples, np.array(s)) for n, s in success.items()]
+        Sensitivity.of(multiples, 0.98, 16, moved).save(path / "sensitivity.json")
     else:
         for i in range(2):
             write_log(path / f"episode_{i}.mcap")

@@ -1,12 +1,18 @@
-"""Where the milliseconds go: what is on the way, and what is beside it."""
+"""Where the milliseconds go: what is on the way, what is beside it, and what is said of servos and of lateness."""
+
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import synthetic_run
 
 from sim2real.artifacts.identification import Estimate, Identification, Judgement
 from sim2real.artifacts.recording import Recording
 from sim2real.graph.episode import Episode, Messages, Steps
-from sim2real.view.timing import delay_blocks, parts_of
+from sim2real.log.reader import read_log
+from sim2real.view.sections import record_banner
+from sim2real.view.timing import delay_blocks, parts_of, schedule, timing_tiles
 
 COUNT = 50
 
@@ -89,3 +95,26 @@ def test_several_transactions_a_step_stay_together(recording):
     names = [name for name, *_ in parts_of(recording)]
     assert "actuator, its transactions included" in names
     assert "actuator on the bus" not in names
+
+
+def banner(port, late):
+    end = {"transactions": 100, "late_replies": late, "lost_replies": 0}
+    episode = SimpleNamespace(metadata={"port": port, "log": {"session_end": end}}, duration_s=1.0)
+    return str(record_banner(SimpleNamespace(episode=episode, dry=False, warnings=())))
+
+
+def test_late_answers_of_an_emulated_robot_are_not_those_of_an_adapter():
+    assert "close what else runs" not in banner("/dev/ttyUSB0", 0)
+    advised = [banner(port, 30) for port in ("/dev/ttyUSB0", "embedded")]
+    assert ["latency timer" in text for text in advised] == [True, False]
+    assert all("close what else runs" in text for text in advised)
+
+
+@pytest.mark.parametrize(("port", "value", "late"), [("/dev/ttyUSB0", " ms", True), ("embedded", "none", False)])
+def test_lateness_is_shown_only_where_it_was_measured(tmp_path, port, value, late):
+    synthetic_run.write_log(tmp_path / "session.mcap")
+    episode = read_log(tmp_path / "session.mcap")
+    episode = replace(episode, metadata={**episode.metadata, "port": port})
+    tile = next(iter(timing_tiles([episode])))
+    assert tile.value.endswith(value)
+    assert ("latest wake-up" in schedule(episode, "record")) is late

@@ -89,6 +89,16 @@ def test_the_numbers_are_there(page):
     assert {"44.8 ± 0.1 ms", "truth 44.6 ms", "98%"} <= words, "the tiles"
     assert {"gate.limit", "2", "ab" * 32} <= words, "configuration and hashes"
     assert {"bus p50", "bus max", "1.230"} <= words, "the time on the bus"
+    assert {"6.700", "6.500 to 6.900", "2.000 to 4.000", "%"} <= words, "links"
+
+
+def test_of_wrong_parameters_the_sentence_comes_before_the_numbers(page):
+    words = [word for word in page.words if word]
+    begin = next(i for i, word in enumerate(words) if word.startswith("Measure 'friction' better: 2 half-widths"))
+    first = words.index("friction", begin)
+    assert words[first - 4 : first] == ["\u22122", "\u22121", "+1", "+2"]
+    assert words[first : first + 5] == ["friction", "rad/s\u00b2", "3.000", "0.2500", "\u22122"]
+    assert words[first + 9] == synthetic_run.EVIL
 
 
 def test_an_unexplained_second_makes_an_accepted_identification_doubtful():
@@ -101,21 +111,13 @@ def test_an_unexplained_second_makes_an_accepted_identification_doubtful():
     assert banners[1].title.startswith("Accepted, but the model does not explain one second")
 
 
-def test_every_stage_has_a_section_and_an_entry_in_the_contents(page):
+def test_every_stage_has_a_section_ids_are_unique_and_links_lead_to_them(page):
     sections = [attrs["id"] for tag, attrs in page.elements if tag == "section"]
     assert sections == ["record", "identify", "train", "deploy"]
-    links = [attrs["href"] for tag, attrs in page.elements if tag == "a"]
-    assert {f"#{s}" for s in sections} <= set(links)
-
-
-def test_ids_are_unique_and_links_lead_somewhere(page):
-    ids = page.values("id")
+    ids, links = page.values("id"), {attrs["href"][1:] for tag, attrs in page.elements if tag == "a"}
     assert len(ids) == len(set(ids))
-    assert {href[1:] for tag, a in page.elements if tag == "a" and (href := a["href"] or "")} <= set(ids)
-
-
-def test_names_become_no_markup(page):
-    assert "b" not in {tag for tag, _ in page.elements}
+    assert set(sections) <= links <= set(ids)
+    assert "b" not in {tag for tag, _ in page.elements}, "names become no markup"
     assert synthetic_run.EVIL in page.words
 
 
@@ -230,17 +232,14 @@ def test_one_seed_and_missing_numbers_are_shown(only):
 
 
 MALFORMED = {
-    "no JSON": ("identify", "parameters.json", b"{", "parameters.json is malformed"),
     "no parameters": ("identify", "parameters.json", b"{}", "missing required field"),
-    "a list": ("train", "history.json", b"[]", "Expected `object`, got `array`"),
+    "no archive": ("identify", "free_runs.npz", b"PK", "free_runs.npz is malformed"),
     "ragged": (
         "train",
         "history.json",
         b'{"steps":[1],"returns":[[1],[2,3]],"success":[[1]],"seconds":[1]}',
         "malformed",
     ),
-    "no free run": ("identify", "free_runs.npz", b"PK", "free_runs.npz is malformed"),
-    "no archive": ("identify", "predictions.npz", b"PK", "predictions.npz is malformed"),
     "no episodes": ("deploy", "result.json", b'{"episodes":[]}', "no episode"),
     "missing": ("deploy", "simulation.npz", None, "cannot read"),
     "no log": ("record", "session.mcap", b"nothing", "session.mcap"),
@@ -257,11 +256,8 @@ def test_what_is_malformed_is_named_with_a_hint(only, case):
         report(run)
     assert caught.value.hint
     assert not (run / "report.html").exists()
-
-
-def test_no_finished_stage_and_no_folder_are_errors(tmp_path):
     with pytest.raises(Sim2RealError, match="no finished stage"):
-        report(tmp_path)
+        report(run.parent)
 
 
 @pytest.mark.parametrize(

@@ -125,16 +125,12 @@ def test_without_the_viewer_the_error_names_the_extra(run, monkeypatch):
     assert "rerun-sdk" in caught.value.hint
 
 
-def test_an_identification_alone_has_nothing_to_play(only, tmp_path):
-    pytest.importorskip("rerun")
-    with pytest.raises(Sim2RealError, match="no recording and no deployment"):
-        view(only("identify"), tmp_path / "run.rrd")
-
-
-def test_a_place_that_cannot_be_written_is_named(run):
+def test_a_place_that_cannot_be_written_and_nothing_to_play_are_named(run, only, tmp_path):
     pytest.importorskip("rerun")
     with pytest.raises(Sim2RealError, match="cannot write"):
         view(run, run / "record" / "session.mcap" / "run.rrd")
+    with pytest.raises(Sim2RealError, match="no recording and no deployment"):
+        view(only("identify"), tmp_path / "run.rrd")
 
 
 @pytest.mark.night
@@ -167,15 +163,10 @@ def drawn_roles(path: Path, picture: Path, wait_s: float = 10.0) -> set[str]:
     return roles
 
 
-@pytest.fixture
-def software_vulkan(monkeypatch):
-    """Environment in which the viewer draws without a graphics card."""
+@pytest.mark.night  # it waits for the pictures of a window
+@needs_rerun
+def test_the_viewer_draws_the_curves(saved, tmp_path, monkeypatch):
+    need(LAVAPIPE.exists(), "a software Vulkan (mesa-vulkan-drivers)")
     monkeypatch.setenv("VK_ICD_FILENAMES", str(LAVAPIPE))
     monkeypatch.setenv("RERUN_ANALYTICS_ENABLED", "0")
-
-
-@needs_rerun
-@pytest.mark.usefixtures("software_vulkan")
-def test_the_viewer_draws_the_curves(saved, tmp_path):
-    need(LAVAPIPE.exists(), "a software Vulkan (mesa-vulkan-drivers)")
     assert drawn_roles(saved, tmp_path / "run.png") == FIRST_TAB
