@@ -125,8 +125,8 @@ class BaseNode:
 
     Args:
         rate: Nominal frequency [Hz].
-                delay: Expected computation delay [s], by which the schedules of readers start later. Default: the 0.99
-            quantile of ``delay_dist``.
+        delay: Expected computation delay [s], by which the schedules of readers start later. Default: the 0.99 quantile
+            of ``delay_dist``.
         delay_dist: Computation delay in simulation: a distrax distribution over seconds, a ``DelayDistribution`` or a
             number of seconds; default 0.
         advance: Whether a step starts as soon as its blocking inputs have arrived, even before the scheduled time.
@@ -189,8 +189,7 @@ class BaseNode:
             delay_dist: Communication delay in simulation; may be a ``TrainableDist``; default 0.
             window: Number of last messages in the step state.
             skip: Whether to ignore this input in the node's phase (needed once in every loop of connections), and to
-                give
-            messages that arrive exactly at a step's start to the next step.
+                give messages that arrive exactly at a step's start to the next step.
             jitter: Treatment of messages that arrive early at a non-blocking input.
             name: Key in ``step_state.inputs``; default: the sender's name.
 

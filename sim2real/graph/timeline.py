@@ -42,8 +42,7 @@ class Timeline:
     def from_episode(episode: Episode, nodes: Mapping[str, BaseNode]) -> Timeline:
         """Return the timeline of one recorded episode (E = 1).
 
-                A trainable delay is set to its smallest value, as in a drawn timeline, so that windows hold the
-                messages for
+        A trainable delay is set to its smallest value, as in a drawn timeline, so that windows hold the messages for
         any delay; the record has the arrivals at the delay during the recording.
 
         Args:

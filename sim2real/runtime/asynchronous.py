@@ -31,29 +31,28 @@ _INTERRUPTED_S = 1.0
 class AsyncGraph:
     """Runs a graph: on hardware in real time, or in simulation in the order of events.
 
-        There are two ways to run it. After ``start``, ``run_for`` and ``wait`` let the graph run, and the supervisor
-        makes its own steps. After ``reset``, as in a gym environment, each ``step`` takes the supervisor's output from
-        the caller and returns the supervisor's next step state. The graph stops when ``with graph:`` is left and when
-        the interpreter exits.
+    There are two ways to run it. After ``start``, ``run_for`` and ``wait`` let the graph run, and the supervisor makes
+    its own steps. After ``reset``, as in a gym environment, each ``step`` takes the supervisor's output from the caller
+    and returns the supervisor's next step state. The graph stops when ``with graph:`` is left and when the interpreter
+    exits.
 
-        A failure stops all nodes at once: each node's ``stop`` is called in the node's thread after its last step. The
-        call that waits for the graph raises the failure, with the node's name; if none waits, the next call does. A
-        step that
+    A failure stops all nodes at once: each node's ``stop`` is called in the node's thread after its last step. The call
+    that waits for the graph raises the failure, with the node's name; if none waits, the next call does. A step that
     hangs is a failure too: its thread is busy, so another thread calls the node's ``stop``. The same applies to a node
     that is still in its startup when the graph stops.
 
     Args:
-            nodes: The nodes, by name or as a list.
-            supervisor: The node at whose steps ``reset``, ``step`` and ``run`` return, usually the policy.
-            clock: The clock; a ``MonotonicClock`` is the wall clock with the time of this object, e.g. of a test.
-            duration_s: Length of drawn timelines [s]; the simulated clock needs this or ``timeline``.
-            timeline: Timelines to play; the graph state's ``eps`` selects the episode. Simulated clock only.
-            timeout_s: Longest wait of a call for the next step, and of the supervisor for its caller [s].
-            step_timeout_s: Time after which a step of any node counts as hanging, which stops the graph [s]; 0: never;
-                default: ten periods of its node, at least 1 s. The caller's time does not count. Wall clock only.
+        nodes: The nodes, by name or as a list.
+        supervisor: The node at whose steps ``reset``, ``step`` and ``run`` return, usually the policy.
+        clock: The clock; a ``MonotonicClock`` is the wall clock with the time of this object, e.g. of a test.
+        duration_s: Length of drawn timelines [s]; the simulated clock needs this or ``timeline``.
+        timeline: Timelines to play; the graph state's ``eps`` selects the episode. Simulated clock only.
+        timeout_s: Longest wait of a call for the next step, and of the supervisor for its caller [s].
+        step_timeout_s: Time after which a step of any node counts as hanging, which stops the graph [s]; 0: never;
+            default: ten periods of its node, at least 1 s. The caller's time does not count. Wall clock only.
 
     Raises:
-            UsageError: The nodes do not form a graph, or an option does not fit the clock.
+        UsageError: The nodes do not form a graph, or an option does not fit the clock.
     """
 
     def __init__(
@@ -121,13 +120,11 @@ class AsyncGraph:
     def stop(self, timeout_s: float = 10.0) -> None:
         """Stop the graph, at any time and from any thread; without effect on a stopped graph.
 
-                A start in progress is ended too: after this call no node's startup is running or will run. Do not call
-                    this in a
-        signal handler: raise an exception there, as Ctrl-C does, and leaving ``with graph:`` stops the graph.
+        A start in progress is ended too: after this call no node's startup is running or will run. Do not call this in
+        a signal handler: raise an exception there, as Ctrl-C does, and leaving ``with graph:`` stops the graph.
 
         Raises:
-                    Sim2RealError: The failure that stopped the graph, if no call has raised it yet; or a node did not
-                        end.
+            Sim2RealError: The failure that stopped the graph, if no call has raised it yet; or a node did not end.
         """
         with self._lock:
             self._stops += 1

@@ -31,8 +31,7 @@ class Clock(Enum):
 class MonotonicClock:
     """Ticks [us] since the episode's start, on the machine's monotonic clock; negative before it.
 
-        The threads of a graph read the time and wait for each other through this class alone, so that ``VirtualClock``
-        can
+    The threads of a graph read the time and wait for each other through this class alone, so that ``VirtualClock`` can
     replace it for an emulated robot.
     """
 

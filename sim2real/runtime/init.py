@@ -31,7 +31,7 @@ class Bounds(NamedTuple):
     """The numbers of a ``TrainableDist``, each of shape ``()``.
 
     Attributes:
-                low: Smallest delay [s].
+        low: Smallest delay [s].
         span: Largest delay minus the smallest [s].
         alpha: Position of the delay between the bounds, in [0, 1].
     """

@@ -27,8 +27,7 @@ _NEVER = 2**62
 class _Link:
     """One connection of the timeline: the messages that each step consumes, and those that the log records.
 
-        The two differ for a trainable delay. The window takes messages in as if the delay were the smallest, and the
-        step
+    The two differ for a trainable delay. The window takes messages in as if the delay were the smallest, and the step
     picks those that have arrived at the current delay; the log has the arrivals at the current delay.
     """
 

@@ -22,8 +22,7 @@ class NodeStatistics(NamedTuple):
         period_s: Time from one step's wake-up to the next one's.
         lateness_s: Time from a step's start by the timing rules to its wake-up.
         overruns: Number of steps that started late only because the previous step had not ended.
-                age_s: Input -> time from the sending of its newest message to a step's start: the age of the data that
-                    a policy
+        age_s: Input -> time from the sending of its newest message to a step's start: the age of the data that a policy
             acts on. Inputs without a message are left out; on the simulated clock also inputs with a trainable delay,
             whose message the step itself picks.
     """

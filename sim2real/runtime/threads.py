@@ -273,7 +273,7 @@ class NodeThread(threading.Thread):
 
     Attributes:
         ready: Set once the startup has succeeded or failed.
-                over: Set when the thread has ended, or its step hangs: nobody waits for it any more.
+        over: Set when the thread has ended, or its step hangs: nobody waits for it any more.
         made_safe: Whether another thread has called the node's ``stop``.
         failed: Whether the graph stopped because a step of this node hangs.
         during: The call in progress: ``startup``, ``step 12`` or ``stop``.

@@ -38,9 +38,8 @@ class _Waiting:
 class VirtualClock(MonotonicClock):
     """The clock of an emulated robot, for the graph that drives it.
 
-        The threads of the graph, and the thread that makes this clock, take turns: one runs until it waits or ends;
-            then the
-    thread whose deadline comes first runs. When all wait, time jumps to that deadline. Computing takes no time, so
+    The threads of the graph, and the thread that makes this clock, take turns: one runs until it waits or ends; then
+    the thread whose deadline comes first runs. When all wait, time jumps to that deadline. Computing takes no time, so
     episodes are equal on every machine and in every repetition.
     """
 

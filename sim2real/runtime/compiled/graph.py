@@ -214,8 +214,7 @@ class CompiledGraph:
     def run(self, gs: GraphState) -> GraphState:
         """Call the supervisor's own ``step``, and run until its next step is due.
 
-                A state from ``init`` is reset first. Before a ``lax.scan`` call ``reset``: it adds an entry to ``seq``,
-                    and the
+        A state from ``init`` is reset first. Before a ``lax.scan`` call ``reset``: it adds an entry to ``seq``, and the
         carry of a scan must keep its structure.
         """
         return self.step(gs if gs.seq else self.reset(gs)[0])[0]
@@ -260,15 +259,14 @@ class CompiledGraph:
         """Run a row up to the supervisor's step.
 
         Args:
-                    inside: Whether the caller guarantees that the timeline has this episode and this row. It saves
-                        masking
-        every update.
+            inside: Whether the caller guarantees that the timeline has this episode and this row. It saves masking
+                every update.
 
         Returns:
-                    The graph's state; the supervisor's step state; and whether the supervisor makes a step in this row.
+            The graph's state; the supervisor's step state; and whether the supervisor makes a step in this row.
 
         Raises:
-                    UsageError: The supervisor makes several steps in one row.
+            UsageError: The supervisor makes several steps in one row.
         """
         self._check_row_start(gs, "observe")
         turn = self._only_slot()
@@ -358,8 +356,7 @@ class CompiledGraph:
     def _play_on(self, gs: GraphState, turn: Number, arrived: Number, hops: int) -> tuple[GraphState, Number]:
         """Run from turn to turn until the supervisor makes a step; return the state and the turn.
 
-                The loop always runs ``hops`` turns, the largest number between two steps. Once the step or the last row
-                is
+        The loop always runs ``hops`` turns, the largest number between two steps. Once the step or the last row is
         reached, the state stays unchanged.
         """
         program, count = self.program, len(self._turns)

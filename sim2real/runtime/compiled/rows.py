@@ -87,8 +87,7 @@ class RowProgram:
 
         Args:
             outputs: Node -> its steps; the steps of these slots are appended.
-                        inside: Whether the caller guarantees that the timelines have this row and episode, which saves
-                            masking.
+            inside: Whether the caller guarantees that the timelines have this row and episode, which saves masking.
         """
         for i in range(begin, end):
             name = self.wiring.slots[i]
@@ -137,7 +136,7 @@ class RowProgram:
         """Return the step state of a slot's step; ``seq`` is -1 if the slot makes no step.
 
         Args:
-                        inside: Whether the caller guarantees that the timelines have this row and episode.
+            inside: Whether the caller guarantees that the timelines have this row and episode.
         """
         table = _at(self._tables[slot], gs)
         if not inside:

@@ -90,8 +90,7 @@ def wire(
 
     Args:
         supervisor: The supervisor's name; a row is at most as long as its period.
-                reusable: Whether to round the lengths of rings up, so that most timelines of a robot give the same
-                    lengths.
+        reusable: Whether to round the lengths of rings up, so that most timelines of a robot give the same lengths.
     """
     if supervisor not in timeline.vertices:
         raise UsageError(f"the supervisor {supervisor!r} is not in the timeline. Nodes: {', '.join(timeline.vertices)}")
