@@ -13,7 +13,7 @@ from sim2real.later import jax, jnp
 from sim2real.robots.messages import JointReading
 from sim2real.robots.probe import Probe
 from sim2real.robots.robot import Embedded, Robot
-from sim2real.robots.servo.model import Hand, ServoModel, friction_causes
+from sim2real.robots.servo.model import Hand, ServoModel
 from sim2real.robots.servo.servos import DataSheet, ServoDrive, Servos
 from sim2real.robots.servo.task import Aim, AimTask, ServoMoment, uniform
 from sim2real.types import Array, Key
@@ -130,7 +130,7 @@ class ArmRobot(Robot):
 
     def __init__(self, servos: Servos = SERVOS) -> None:
         self.drive = ServoDrive(servos, probe=Probe(step=0.12, lag_s=(0.008, 0.0115)), embedded=embedded)
-        self.model = ServoModel(servos, MJCF, HAND, causes=friction_causes(servos.names))
+        self.model = ServoModel(servos, MJCF, HAND)
         self.task = AimTask(servos, TARGET, reward, success, score, FEATURES, observe)
 
 

@@ -110,8 +110,10 @@ def dynamics() -> list[Parameter]:
 
     th'' = gain * V + gravity * sin(th) - damping * th' - friction * sign(th'). A log determines these four groups; J,
     K, R and the rest appear only in them: the model keeps its nominal J, R and length and takes the groups through
-    the others.
+    the others. A payload where the mass is changes all of them, and inertia about the axis alone.
     """
+    p = nominal_params()
+    share = float(p.mass * p.length**2 / p.J)  # of the mass in the inertia
     about = {
         "gain": ("rad/s^2/V", "acceleration per volt, K / (R J)"),
         "gravity": ("rad/s^2", "m g l / J"),
@@ -122,17 +124,10 @@ def dynamics() -> list[Parameter]:
         Parameter(
             name, about[name][0], float(value), float(value) / 4, float(value) * 4, about=about[name][1],
             vanishes=name in ("damping", "friction"),
+            causes={"payload": float(name == "gravity") - share, "inertia": -1.0},
         )
-        for name, value in groups(nominal_params()).items()
+        for name, value in groups(p).items()
     ]  # fmt: skip
-
-
-def causes() -> dict[str, dict[str, float]]:
-    """Return what moves several groups at once: a payload where the mass is, and inertia about the axis alone."""
-    p, names = nominal_params(), ("gain", "gravity", "damping", "friction")
-    share = float(p.mass * p.length**2 / p.J)  # of the mass in the inertia
-    payload = dict.fromkeys(names, -share) | {"gravity": 1.0 - share}
-    return {"payload": payload, "inertia": dict.fromkeys(names, -1.0)}
 
 
 class PendulumWorld(JointWorld):

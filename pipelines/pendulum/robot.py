@@ -21,7 +21,7 @@ from sim2real.robots.robot import Embedded, Exported, Judgement, Robot, RobotDri
 from sim2real.types import Key, Scalar
 
 from .mjcf import HINGE, STEP_S, mjcf_of
-from .model import HISTORY, Agent, Command, Measurement, PendulumParams, PendulumWorld, causes, dynamics, from_groups
+from .model import HISTORY, Agent, Command, Measurement, PendulumParams, PendulumWorld, dynamics, from_groups
 
 if TYPE_CHECKING:
     from sim2real.hardware.device import Device, Following, Reading
@@ -119,7 +119,7 @@ class HingeDrive(RobotDrive):
 class HingeModel(RobotModel):
     """The pendulum as a differential equation, with four groups of parameters."""
 
-    tick_s, causes = 1 / WORLD_HZ, causes()
+    tick_s = 1 / WORLD_HZ
 
     def dynamics(self) -> list[Parameter]:
         return dynamics()

@@ -19,7 +19,7 @@ from sim2real.later import jax, jnp
 from sim2real.robots.messages import JointReading
 from sim2real.robots.probe import Probe
 from sim2real.robots.robot import Embedded, Robot
-from sim2real.robots.servo.model import Hand, ServoModel, friction_causes, goal_offsets, servo_parameters
+from sim2real.robots.servo.model import Hand, ServoModel, goal_offsets, servo_parameters
 from sim2real.robots.servo.servos import ServoDrive, Servos, StsSheet
 from sim2real.robots.servo.task import Aim, AimTask, ServoMoment, uniform
 from sim2real.types import Array, Key
@@ -94,8 +94,7 @@ class SO101Robot(Robot):
         settings = partial(calibrated, calibration=calibration)
         probe = Probe(step=0.12, lag_s=(-0.009, -0.004))
         self.drive = ServoDrive(servos, probe=probe, embedded=embedded, settings=settings)
-        more: dict[str, Any] = {"dynamics": dynamics, "causes": friction_causes(JOINTS)}
-        self.model = ServoModel(servos, MJCF, HAND, step_s=STEP_S, **more)
+        self.model = ServoModel(servos, MJCF, HAND, step_s=STEP_S, dynamics=dynamics)
         self.task = AimTask(servos, TARGET, reward, success, score, FEATURES, observe)
 
 

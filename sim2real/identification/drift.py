@@ -1,6 +1,6 @@
 """Test whether a later log is still of the identified robot: of each parameter, and of causes that move several."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,8 +30,6 @@ identified a minute before, seemed to be 0.4 ms longer."""
 _LEAST = 0.1
 """Smallest share of the error that a change explains in an alarm. In 112 changed robots the right
 change explained 0.2 or more; in nine unchanged ones a torque limit explained 0.05 at most."""
-Causes = Mapping[str, Mapping[str, float]]
-"""Name of a cause -> parameter -> its move on its scale when the cause grows by a factor of e."""
 
 
 @dataclass(frozen=True)
@@ -71,21 +69,19 @@ class Fitted:
         return max(self.segments - 1.0, 1.0) * ((self.by_log + self.by_posterior) / max(self.by_log, 1e-300)) ** 2
 
 
-def ways(table: ParameterTable, causes: Causes) -> list[Way]:
-    """Return the changes to test: of each parameter, and of causes.
-
-    A cause that moves unidentified parameters is not tested.
-    """
+def ways(table: ParameterTable) -> list[Way]:
+    """Return the changes to test: of each parameter, and of causes that move several identified ones, and no other."""
     kinds = [c.kind for c in table.columns]
     names = [ROUND_TRIP if k == "delay" and kinds.count(k) == 1 else n for k, n in zip(kinds, table.names, strict=True)]
     changes = [Way(n, np.eye(len(table))[i]) for i, n in enumerate(names)]
-    for cause, shares in causes.items():
-        if set(shares) <= set(table.names):
+    for cause in dict.fromkeys(cause for p in table for cause in p.causes):
+        shares = {p.name: p.causes[cause] for p in table if cause in p.causes}
+        if len(shares) > 1 and set(shares) <= set(table.names):
             changes.append(Way(cause, np.array([shares.get(n, 0.0) for n in table.names])))
     return changes
 
 
-def drift(problem: Problem, posterior: Posterior, widening: float, causes: Causes) -> tuple[Drift, np.ndarray]:
+def drift(problem: Problem, posterior: Posterior, widening: float) -> tuple[Drift, np.ndarray]:
     """Test whether a log agrees with the identified robot.
 
     Each change is fitted alone, because a short log of a policy that soon stands still cannot determine all parameters.
@@ -96,7 +92,6 @@ def drift(problem: Problem, posterior: Posterior, widening: float, causes: Cause
         posterior: The identification; other parameters of the problem had their nominal values.
         widening: Factor on the posterior's deviations that covers the errors of the model: they act like other
             parameters in each motion, and a policy moves differently than an excitation.
-        causes: Known causes that move several parameters.
 
     Returns:
         The tests, and the point ``(P,)`` on the parameters' scales that explains the log best: that of the change that
@@ -110,7 +105,7 @@ def drift(problem: Problem, posterior: Posterior, widening: float, causes: Cause
     posterior = _with_known(posterior, table)
     values, axes = np.linalg.eigh(posterior.covariance)
     root = widening * axes * np.sqrt(np.maximum(values, 0.0))
-    tried = [_alone(problem, posterior.mean, root, way) for way in ways(table, causes)]
+    tried = [_alone(problem, posterior.mean, root, way) for way in ways(table)]
     fitted = [one for one in tried if one is not None]
     if not fitted:
         raise Sim2RealError("this log determines no parameter", hint="deploy a policy that moves the robot")

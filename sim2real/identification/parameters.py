@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -47,6 +47,8 @@ class Parameter:
         begin: Start of a search; None: the nominal value; of a delay, a value within its bounds. The search of a limit
             that no motion reaches begins below it, as the residuals depend on it there.
         narrowed: Whether its lower bound is above the model's.
+        causes: Cause that changes several parameters at once, such as a payload -> change of this one on its scale when
+            the cause grows by a factor of e.
     """
 
     name: str
@@ -68,6 +70,7 @@ class Parameter:
     begin: float | None = None
     narrowed: bool = False
     excite: str = ""
+    causes: Mapping[str, float] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
         """Check the bounds."""

@@ -249,12 +249,9 @@ class RobotModel(ABC):
 
     Attributes:
         tick_s: The world's period [s].
-        causes: Causes that change several parameters at once: name -> parameter -> change of the parameter on its scale
-            when the cause grows by a factor of e.
     """
 
     tick_s: float
-    causes: Mapping[str, Mapping[str, float]] = _NOTHING
 
     @abstractmethod
     def dynamics(self) -> list[Parameter]:
@@ -443,6 +440,11 @@ def in_world(robot: AnyRobot, name: str | None) -> AnyRobot:
     robot = copy.copy(robot)
     robot.model = model
     return robot
+
+
+def channels_of(robot: RecordedRobot) -> tuple[Channel, ...]:
+    """Return the measured quantities of each joint: those of the drive, or of the logs."""
+    return getattr(robot, "drive", robot).channels
 
 
 GRAVITY = "gravity in the base's axes"

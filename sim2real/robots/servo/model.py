@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
 import mujoco
@@ -93,9 +92,8 @@ class ServoModel(RobotModel):
         step_s: float = 0.0025,
         tick_s: float = 0.01,
         dynamics: Callable[[], list[Parameter]] | None = None,
-        causes: Mapping[str, Mapping[str, float]] = MappingProxyType({}),
     ) -> None:
-        self.servos, self.mjcf, self.hand, self.causes = servos, mjcf, hand, causes
+        self.servos, self.mjcf, self.hand = servos, mjcf, hand
         self.step_s, self.tick_s, self.lead_s, self._dynamics = step_s, tick_s, 0.5 * step_s, dynamics
 
     def dynamics(self) -> list[Parameter]:
@@ -301,7 +299,8 @@ _SET = (
 def servo_parameters(sheet: DataSheet, joints: Sequence[str], own: Sequence[str] = ("friction",)) -> list[Parameter]:
     """Return gain, damping, rotor inertia and friction, bounded to factors of 3 to 10 of the data sheet.
 
-    If friction decreases with speed, the width of this decrease, ``stribeck``, is a parameter.
+    If friction decreases with speed, the width of this decrease, ``stribeck``, is a parameter. The temperature of
+    grease and gears changes the friction of all joints.
 
     Args:
         own: Quantities with a value for each joint, named as ``friction_JOINT``; joints share the others.
@@ -314,7 +313,16 @@ def servo_parameters(sheet: DataSheet, joints: Sequence[str], own: Sequence[str]
         "stribeck": ("rad/s", sheet.stribeck_rad_s, 10, "speed at which 1/e of the dry friction is left"),
     }
     return [
-        Parameter(label, unit, value, value / factor, value * factor, about=about, vanishes=name in _NAMES[1:])
+        Parameter(
+            label,
+            unit,
+            value,
+            value / factor,
+            value * factor,
+            about=about,
+            vanishes=name in _NAMES[1:],
+            causes={"friction": 1.0} if name == "friction" else {},
+        )
         for name, (unit, value, factor, about) in table.items()
         if value is not None
         for label in ([f"{name}_{joint}" for joint in joints] if name in own else [name])
@@ -326,11 +334,6 @@ def goal_offsets(joints: Sequence[str]) -> list[Parameter]:
     about, most = "rest position without load, from its goal", _MOST_OFFSET_RAD
     names = [f"{OFFSET}_{joint}" for joint in joints]
     return [Parameter(name, "rad", 0.0, -most, most, "linear", about=about) for name in names]
-
-
-def friction_causes(joints: Sequence[str]) -> dict[str, dict[str, float]]:
-    """Return the causes that change parameters of all joints: the temperature of grease and gears changes friction."""
-    return {"friction": {f"friction_{joint}": 1.0 for joint in joints}}
 
 
 def _each(values: Mapping[str, Scalar], name: str, joints: Sequence[str], otherwise: float | None) -> PyTree:

@@ -49,10 +49,6 @@ def uniform(key: Key | int, low: PyTree, high: PyTree) -> Array:
     return jax.random.uniform(key, np.shape(low), minval=np.asarray(low), maxval=np.asarray(high))
 
 
-NO_AIM = Aim((), lambda key: np.zeros(0, np.float32))
-"""The aim of a task that is the same in every episode."""
-
-
 class ServoMoment(NamedTuple):
     """What a reward sees after a policy step.
 

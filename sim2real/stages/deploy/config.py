@@ -1,31 +1,25 @@
 """Flags of deploy. Imports no JAX, so that ``--help`` stays instant."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated
 
 from sim2real.errors import UsageError
-from sim2real.hardware.safety.gate import GateLimits
-from sim2real.stages.flag import Flag, ViewFlag, check_seed, check_view
+from sim2real.stages.flag import Flag
+from sim2real.stages.session.config import SessionConfig
 
 
 @dataclass(frozen=True)
-class DeployConfig:
+class DeployConfig(SessionConfig):
     """Run the policy on the robot and compare with the simulation."""
 
-    port: Annotated[str, Flag("PORT")] = "embedded"
-    """Serial port of the servo bus, or 'embedded' for the emulated robot."""
     bundle: Annotated[str | None, Flag("RUN|PIPELINE|BUNDLE")] = None
     """Policy: a bundle's folder, a run, or a pipeline; default: the newest training, or the bundle that the pipeline
     ships."""
     episodes: int = 2
     """Number of episodes."""
-    duration_s: float = 10.0
-    """Length of an episode [s]."""
     settle_s: float = 20.0
     """Longest wait for the robot to come to rest before an episode [s]."""
-    seed: int = 0
-    """Seed of the embedded robot."""
     blend_s: float = 0.0
     """Time in which the policy's action grows from zero to full size, for a first try on a robot [s]."""
     measure_delay: bool = True
@@ -37,24 +31,15 @@ class DeployConfig:
     another kind of port."""
     hold: bool = False
     """Hold the robot at the end of an episode, or after Ctrl-C, until Enter is pressed: it may fall without torque."""
-    dry_run: bool = False
-    """Do everything except moving the robot: no torque, no goals; the withheld commands are logged and summed up."""
-    strict_timing: bool = False
-    """End with code 5 when more than 1 % of the steps miss their deadline."""
-    view: ViewFlag = None
-    """Show the robot live in the Rerun viewer; 'web': on a page for browsers."""
     command: Annotated[tuple[float, float, float] | None, Flag("X Y YAW")] = None
     """Commanded velocity of a robot that walks: forwards, to the left [m/s], yaw rate [rad/s]; default: each episode
     has four of its own."""
     max_tilt_rad: float | None = None
     """Largest tilt [rad]; a robot that measures its tilt stops above it. Default: no limit."""
-    gate: GateLimits = field(default_factory=GateLimits)
-    """Limits on every command."""
 
     def __post_init__(self) -> None:
         """Check the fields, before the robot moves."""
-        check_seed(self.seed)
-        check_view(self.view)
+        super().__post_init__()
         if self.max_tilt_rad is not None and not 0.0 < self.max_tilt_rad <= math.pi:
             raise UsageError(f"max_tilt_rad must lie in (0, pi] rad, got {self.max_tilt_rad}")
         if not (0.0 <= self.blend_s <= 60.0 and 0.0 < self.delay_tolerance_s <= 1.0):
@@ -64,7 +49,5 @@ class DeployConfig:
             )
         if self.episodes < 1:
             raise UsageError(f"episodes must be at least 1, got {self.episodes}")
-        if not 1.0 <= self.duration_s <= 3600.0:
-            raise UsageError(f"duration_s must lie in [1, 3600] s, got {self.duration_s}")
         if not 0.0 < self.settle_s <= 600.0:
             raise UsageError(f"settle_s must lie in (0, 600] s, got {self.settle_s}")

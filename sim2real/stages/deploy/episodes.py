@@ -55,9 +55,9 @@ def run_episodes(
             bench.rig.follow(following)
         _announce_following(bench.rig.following)
         # Measure the delay before the policy moves the robot: a policy trained for another delay may oscillate.
-        delay = _measure_delay(bench, bundle.contract, folder)
+        delay = _measure_delay(bench, bundle.contract, config, folder)
         for i, log in enumerate(logs):
-            _run_one(bench, policy, i, log)
+            _run_one(bench, policy, config, i, log)
     return delay
 
 
@@ -71,9 +71,9 @@ def _announce_following(following: Following | None) -> None:
     note(f"a joint that is more than {most} off its commands stops the robot, by {following.source}")
 
 
-def _measure_delay(bench: Bench, contract: PolicyContract, folder: Path) -> str:
+def _measure_delay(bench: Bench, contract: PolicyContract, config: DeployConfig, folder: Path) -> str:
     """Bring the robot to rest, measure its delay with small steps and log them; return the delay as a text."""
-    config, drive = bench.config, bench.robot.drive
+    drive = bench.robot.drive
     if config.dry_run or not config.measure_delay or drive.probe is None:
         return ""
     note("waiting for the robot to come to rest, then a few small steps to measure its delay")
@@ -85,8 +85,7 @@ def _measure_delay(bench: Bench, contract: PolicyContract, folder: Path) -> str:
         _write_probe(folder / PROBE, bench.robot, witness)
 
 
-def _run_one(bench: Bench, policy: Runner, trial: int, log: Path) -> None:
-    config = bench.config
+def _run_one(bench: Bench, policy: Runner, config: DeployConfig, trial: int, log: Path) -> None:
     length = f"{config.duration_s:g} s on {config.port}"
     if config.dry_run:
         note(f"dry run: the robot is not moved to its start; {length}")
@@ -94,7 +93,7 @@ def _run_one(bench: Bench, policy: Runner, trial: int, log: Path) -> None:
         note(f"waiting for the robot to come to rest, then {length}")
         bench.robot.drive.prepare(bench.rig, config.settle_s)
     nodes, params = deployment_nodes(bench.robot, bench.rig, policy, trial)
-    bench.run_episode(nodes, params, log, config.duration_s, "deploy")
+    bench.run_episode(nodes, params, log, config.duration_s, "deploy", config.hold)
 
 
 # -- the test of the delay, and its log: the model is tested on it as on an episode

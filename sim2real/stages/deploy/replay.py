@@ -20,7 +20,7 @@ from sim2real.identification.parameters import ParameterTable
 from sim2real.identification.predictions import NOISE, Position, positions
 from sim2real.identification.residuals import Problem
 from sim2real.identification.segments import Span
-from sim2real.robots.robot import RecordedRobot, Robot, watched
+from sim2real.robots.robot import RecordedRobot, watched
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.shared.identification import identified_robot, side_by_side
 
@@ -50,8 +50,7 @@ def tested(
     problem, ahead_s = _problem(robot, identification, episodes, config)
     posterior = identification.needed_posterior()
     # Test each parameter, and fit all of them to this log.
-    causes = robot.model.causes if isinstance(robot, Robot) else {}
-    drifted, x = drift_test.drift(problem, posterior, posterior.widening, causes)
+    drifted, x = drift_test.drift(problem, posterior, posterior.widening)
     z = refine(problem, problem.table.within(x)[None], gain=problem.precision).x
     refitted = {n: float(np.ravel(v)[0]) for n, v in problem.table.decode(z).items()}
     nominal = {p.name: p.nominal for p in problem.model.parameters}

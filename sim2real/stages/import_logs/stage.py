@@ -19,6 +19,7 @@ from sim2real.log.importing.readers import Table, joined, open_tables
 from sim2real.robots.model.drives import joints_of, ranges_of, slides_of
 from sim2real.robots.model.file import read_model
 from sim2real.robots.model.robot import MjcfRobot
+from sim2real.robots.robot import channels_of
 from sim2real.stages.import_logs.config import ImportConfig
 from sim2real.stages.load import folder_of, load_robot
 from sim2real.stages.terminal.console import note, pairs, progress, wrote
@@ -110,11 +111,10 @@ def hints_of(config: ImportConfig) -> ImportHints:
         return hints_of_model(config.mjcf, name, config.joints, config.rate_hz, **more)
     if config.pipeline is None:
         return ImportHints("robot", config.rate_hz, config.joints, **more)
-    robot: Any = load_robot(config.pipeline)
+    robot = load_robot(config.pipeline)
     if isinstance(robot, MjcfRobot):
         return hints_of_model(robot.config.model, config.pipeline, robot.config.joints, config.rate_hz, **more)
-    channels = getattr(robot, "drive", robot).channels  # a recorded robot has no drive
-    joints = tuple(c.label for c in channels)
+    joints = tuple(c.label for c in channels_of(robot))
     return ImportHints(config.pipeline, config.rate_hz, config.joints or joints, **more)
 
 

@@ -1,4 +1,4 @@
-"""How the robot is recorded; every field is a flag. Imports no JAX, so that ``--help`` stays instant."""
+"""How the robot is moved and recorded; every field is a flag. Imports no JAX, so that ``--help`` stays instant."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,11 +13,36 @@ _FILES = (".mcap", ".csv", ".npz", ".json", ".parquet")
 
 
 @dataclass(frozen=True)
-class RecordConfig:
-    """Record the robot under an excitation."""
+class SessionConfig:
+    """What every session with the robot has."""
 
     port: Annotated[str, Flag("PORT")] = "embedded"
     """Serial port of the servo bus, or 'embedded' for the emulated robot."""
+    duration_s: float = 10.0
+    """Length of an episode [s]."""
+    seed: int = 0
+    """Seed of the embedded robot, and of the excitation of a recording."""
+    dry_run: bool = False
+    """Do everything but move the robot: no torque, no goals; what would have been sent is logged and summed up."""
+    strict_timing: bool = False
+    """End with code 5 when more than 1 % of the steps miss their deadline."""
+    view: ViewFlag = None
+    """Show the robot live in the Rerun viewer; 'web': on a page for browsers."""
+    gate: GateLimits = field(default_factory=GateLimits)
+    """Limits on every command."""
+
+    def __post_init__(self) -> None:
+        """Check what can be checked before anything moves."""
+        check_seed(self.seed)
+        check_view(self.view)
+        if not 1.0 <= self.duration_s <= 3600.0:
+            raise UsageError(f"duration_s must lie in [1, 3600] s, got {self.duration_s}")
+
+
+@dataclass(frozen=True)
+class RecordConfig(SessionConfig):
+    """Record the robot under an excitation."""
+
     duration_s: float = 40.0
     """Length of the recording [s]."""
     excitation: Annotated[str, Flag("multisine|chirp|steps|hand|standing|FILE")] = "multisine"
@@ -29,16 +54,6 @@ class RecordConfig:
     """Lowest frequency of the excitation [Hz]."""
     high_hz: float = 3.0
     """Highest frequency of the excitation [Hz]."""
-    seed: int = 0
-    """Seed of the excitation, and of the embedded robot."""
-    dry_run: bool = False
-    """Do everything but move the robot: no torque, no goals; what would have been sent is logged and summed up."""
-    strict_timing: bool = False
-    """End with code 5 when more than 1 % of the steps miss their deadline."""
-    view: ViewFlag = None
-    """Show the robot live in the Rerun viewer; 'web': on a page for browsers."""
-    gate: GateLimits = field(default_factory=GateLimits)
-    """Limits on every command."""
 
     @property
     def by_hand(self) -> bool:
@@ -57,15 +72,12 @@ class RecordConfig:
 
     def __post_init__(self) -> None:
         """Check what can be checked before anything moves."""
-        check_seed(self.seed)
-        check_view(self.view)
+        super().__post_init__()
         if self.excitation not in (*GENERATED, HAND, STANDING) and self.motion is None:
             raise UsageError(
                 f"--excitation {self.excitation} is neither {', '.join(GENERATED)}, {HAND} nor {STANDING}, nor a file",
                 hint="a motion is a log (.mcap), or a .csv, .npz, .json or .parquet file",
             )
-        if not 1.0 <= self.duration_s <= 3600.0:
-            raise UsageError(f"duration_s must lie in [1, 3600] s, got {self.duration_s}")
         if not 0.0 < self.low_hz < self.high_hz:
             raise UsageError(f"the excitation needs 0 < low_hz < high_hz, got {self.low_hz} and {self.high_hz} Hz")
         if self.excitation in GENERATED and not 0.0 < self.amplitude <= self.gate.limit:

@@ -32,8 +32,7 @@ from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import MonotonicClock, realtime
 from sim2real.runtime.failure import noted
 from sim2real.runtime.virtual import VirtualClock
-from sim2real.stages.deploy.config import DeployConfig
-from sim2real.stages.session.config import RecordConfig
+from sim2real.stages.session.config import SessionConfig
 from sim2real.stages.terminal.console import artifact_table, note, progress, table
 from sim2real.stages.terminal.interruption import interruptible
 
@@ -74,15 +73,14 @@ class Watch:
 
 
 @contextmanager
-def opened(robot: Robot, config: RecordConfig | DeployConfig, truth_path: Path) -> "Iterator[Bench]":
+def opened(robot: Robot, config: SessionConfig, truth_path: Path, hanging: bool = False) -> "Iterator[Bench]":
     """Open the robot for a stage, with torque off; in a dry run with torque withheld until it is closed.
 
     Args:
-        config: Port, limits, seed, and whether it is a dry run.
+        hanging: Whether a robot on legs hangs in a stand, to be recorded.
     """
     if config.dry_run:
         note("dry run: torque stays off and no goal is sent; what would have been sent is logged")
-    hanging = isinstance(config, RecordConfig) and not config.standing
     with connected(robot.drive, config.port, config.gate, truth_path, config.seed, hanging) as rig, realtime():
         if config.dry_run:
             rig.withhold_torque()
@@ -97,20 +95,26 @@ class Bench:
 
     robot: Robot
     rig: Rig
-    config: Any
+    config: SessionConfig
 
     def run_episode(
-        self, nodes: Mapping[str, BaseNode], params: Mapping[str, Any], log: Path, duration_s: float, label: str
+        self,
+        nodes: Mapping[str, BaseNode],
+        params: Mapping[str, Any],
+        log: Path,
+        duration_s: float,
+        label: str,
+        hold: bool = False,
     ) -> None:
         """Run the graph and log it; after every failure the motors have no torque and the log is readable.
 
         Args:
             duration_s: How long to run [s].
+            hold: Whether to hold the robot at its end until Enter is pressed.
 
         Raises:
             Sim2RealError: What stopped the robot.
         """
-        hold = getattr(self.config, "hold", False)
         # Without an agent, as in a recording by hand, the sensor is the only node.
         clock = MonotonicClock() if self.rig.clock is SYSTEM_CLOCK else VirtualClock(self.rig.clock)
         graph = AsyncGraph(nodes, nodes.get(AGENT) or nodes[SENSOR], clock)

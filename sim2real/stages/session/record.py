@@ -44,7 +44,8 @@ def record(robot: AnyRobot, folder: AnyPath, config: RecordConfig | Mapping[str,
     signal = None if config.by_hand else played(config, robot, announce=True)
     duration_s = config.duration_s if signal is None else len(signal) / robot.drive.rate_hz
     note(f"recording {duration_s:g} s of {config.excitation} on {config.port}")
-    with live_view(config.view, folder, robot.name, partial(scene_of, robot)), opened(robot, config, truth) as bench:
+    scene, hanging = partial(scene_of, robot), not config.standing
+    with live_view(config.view, folder, robot.name, scene), opened(robot, config, truth, hanging) as bench:
         if signal is None:
             bench.rig.withhold_torque()
             note("torque is off: move the robot by hand", urgent=True)

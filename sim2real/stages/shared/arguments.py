@@ -21,7 +21,7 @@ from sim2real.log.importing.importer import import_file
 from sim2real.log.schema import unit_of
 from sim2real.robots.identified import LoggedRobot
 from sim2real.robots.loop import ACTUATOR, SENSOR
-from sim2real.robots.robot import RecordedRobot, Robot, in_world
+from sim2real.robots.robot import RecordedRobot, channels_of, in_world
 from sim2real.stages.load import available, defaults_of, mapping_of
 from sim2real.stages.terminal.console import note
 
@@ -154,10 +154,10 @@ def open_recording(path: Path, robot: RecordedRobot) -> Recording:
     """
     if (mapping := mapping_of(robot, path)) is not None:
         recording = Recording(path, import_file(path, mapping))
-        owner: Any = robot.drive if isinstance(robot, Robot) else robot
-        joints, read = [c.label for c in owner.channels], recording.episode.outputs.get(SENSOR, {})
-        for field in {c.position for c in owner.channels if c.index is not None} & set(read):
-            entries, width = {c.index for c in owner.channels if c.position == field}, read[field].shape[-1]
+        channels, read = channels_of(robot), recording.episode.outputs.get(SENSOR, {})
+        joints = [c.label for c in channels]
+        for field in {c.position for c in channels if c.index is not None} & set(read):
+            entries, width = {c.index for c in channels if c.position == field}, read[field].shape[-1]
             # A robot of one joint may take an entry of a longer vector.
             if max(entries) >= width or (len(entries) > 1 and len(entries) != width):
                 raise UsageError(
