@@ -21,16 +21,12 @@ def generator():
     return np.random.default_rng(0)
 
 
-@pytest.mark.parametrize("dist", [0.01, np.float32(0.01), 0, distrax.Deterministic(0.01), distrax.Normal(0.01, 0.0)])
-def test_constants(dist):
-    d = StaticDist(dist)
-    expected = 0 if dist == 0 else 0.01
-    np.testing.assert_allclose(d.sample(generator(), (2, 3)), expected, rtol=1e-6)
-    assert d.quantile(0.5) == pytest.approx(expected)
-    assert d.window(100.0) == 0
-
-
-def test_samples_are_clipped_at_0_and_quantiles_follow():
+def test_static_delays_are_constants_or_samples_clipped_at_0_with_quantiles_that_follow():
+    for dist in (0.01, np.float32(0.01), 0, distrax.Deterministic(0.01), distrax.Normal(0.01, 0.0)):
+        d, expected = StaticDist(dist), 0 if dist == 0 else 0.01
+        np.testing.assert_allclose(d.sample(generator(), (2, 3)), expected, rtol=1e-6)
+        assert d.quantile(0.5) == pytest.approx(expected)
+        assert d.window(100.0) == 0
     d = StaticDist(distrax.Normal(0.0, 1.0))
     samples = d.sample(generator(), (4, 50_000))
     assert samples.min() == 0.0
@@ -38,22 +34,8 @@ def test_samples_are_clipped_at_0_and_quantiles_follow():
     assert d.quantile(0.3) == 0.0
     assert d.quantile(0.99) == pytest.approx(stats.norm.ppf(0.99))
     assert BaseNode("n", 10, delay_dist=distrax.Normal(0.01, 0.003)).delay == pytest.approx(0.016979, abs=1e-6)
-
-
-def test_other_distributions_answer_from_samples():
-    d = StaticDist(distrax.Gamma(2.0, 100.0))
-    assert d.quantile(0.9) == pytest.approx(stats.gamma.ppf(0.9, 2.0, scale=0.01), rel=0.03)
-
-
-NAN = float("nan")
-
-
-@pytest.mark.parametrize(
-    "bad", [-0.1, NAN, np.float32("inf"), "0.1", distrax.Deterministic(-1.0), distrax.Normal(NAN, 0.1)]
-)
-def test_what_is_no_delay_is_refused(bad):
-    with pytest.raises(UsageError):
-        StaticDist(bad)
+    gamma = StaticDist(distrax.Gamma(2.0, 100.0))  # without a quantile of its own: from samples
+    assert gamma.quantile(0.9) == pytest.approx(stats.gamma.ppf(0.9, 2.0, scale=0.01), rel=0.03)
 
 
 def test_recorded_delays_come_back_in_blocks():
@@ -183,6 +165,48 @@ def test_a_message_is_received_its_delay_after_it_was_sent(interp):
     empty, age = window_of(ts, [], [], 5, 0.5, ts)
     empty = empty.replace(ts_recv=jnp.zeros(5))
     assert float(dist.apply(empty, age, 1, PERIOD, ts).ts_recv[-1]) == 0.0
+
+
+DTYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "bool")
+
+
+@pytest.mark.parametrize("interp", ["linear", "zoh_mean", "zoh"])
+def test_whole_numbers_booleans_and_keys_hold(interp):
+    """Each message uses the whole range of its dtype: the largest steps lie beside the one that holds."""
+    sent = np.array([0.10, 0.12, 0.14, 0.16, 0.18])  # at this delay the last arrival before 0.2 s is that of 0.16 s
+    limits = {d: (0, 1) if d == "bool" else (np.iinfo(d).min, np.iinfo(d).max) for d in DTYPES}
+    values = {d: jnp.array([low, high, low, high, low], d) for d, (low, high) in limits.items()}
+    pairs = {d: jnp.stack([v, v[::-1]], axis=1) for d, v in values.items()}
+    keys = jax.random.split(jax.random.key(0), 5)
+    wide = InputState(
+        jnp.arange(5), jnp.asarray(sent), jnp.asarray(sent + LOW), {"v": values, "pairs": pairs, "k": keys}
+    )
+    got = TrainableDist.create(0.034, LOW, HIGH, interp).apply(wide, jnp.asarray(0.2 - sent), 1, PERIOD, 0.2)
+    assert int(got.seq[-1]) == 3
+    for dtype in DTYPES:
+        assert got.data["v"][dtype].dtype == dtype
+        assert got.data["v"][dtype][-1] == values[dtype][3]
+        np.testing.assert_array_equal(got.data["pairs"][dtype][-1], pairs[dtype][3])
+    assert jax.random.key_data(got.data["k"][-1]).tolist() == jax.random.key_data(keys[3]).tolist()
+
+
+@pytest.mark.parametrize(("interp", "skip"), [("linear", False), ("linear", True), ("zoh", False), ("zoh", True)])
+def test_ties_and_defaults(interp, skip):
+    """A message that arrives with the start, up to float32; a burst of two that do; and before the first one."""
+
+    def read(delay, sent, values, seq=None, ages=None):
+        stamps = jnp.asarray(sent, jnp.float32)
+        seq = jnp.arange(len(sent)) if seq is None else jnp.asarray(seq)
+        ages = jnp.float32(0.2) - stamps if ages is None else jnp.asarray(ages, jnp.float32)
+        wide = InputState(seq, stamps, stamps + LOW, values)
+        got = TrainableDist.create(delay, LOW, 0.05, interp).apply(wide, ages, 1, PERIOD, 0.2, skip)
+        return int(got.seq[0]), float(got.data[0])
+
+    assert read(0.04, [0.12, 0.14, 0.16, 0.18], jnp.array([20, 30, 40, 50], jnp.uint8))[1] == (30 if skip else 40)
+    assert read(0.034, [0.12, 0.166, 0.166], jnp.array([1.0, 2.0, 3.0]))[1] == pytest.approx(
+        3.0 if not skip else {"linear": 2.0, "zoh": 1.0}[interp]
+    )
+    assert read(0.034, [0, 0, 0.18], jnp.array([7, 7, 200], jnp.uint8), [-1, -1, 0], [1e6, 1e6, 0.02]) == (-1, 7)
 
 
 @settings(max_examples=25)

@@ -1,4 +1,4 @@
-"""Timing rules on cases small enough to work out by hand, and all of them against the rules by the letter."""
+"""The timing rules against a second implementation, by the letter; what it does not draw, and what is refused."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from oracles.reference import Reference
 from sim2real.errors import UsageError
 from sim2real.graph import BaseNode, BaseWorld, Timeline, TrainableDist
 from sim2real.graph.rules import eligible, quota, slot
-from sim2real.graph.schedule import derive, draw
+from sim2real.graph.schedule import draw
 from sim2real.graph.times import NEVER, Vertex
 
 MS = 1000
@@ -24,35 +24,6 @@ def by_name(*nodes):
     return {n.name: n for n in nodes}
 
 
-def starts(node, *busy_ms, **others):
-    """Return the starts [ms] of a node that runs with the given computation delays [ms]."""
-    nodes = by_name(node, *others.pop("senders", []))
-    delays = {node.name: ms(*busy_ms), **{n: ms(*d) for n, d in others.pop("busy", {}).items()}}
-    transfers = {k: ms(*d) for k, d in others.pop("travel", {}).items()}
-    timeline = derive(nodes, delays, transfers, int(NEVER))
-    return (timeline.vertices[node.name].start[0] / MS).tolist(), timeline
-
-
-# Rule 1: phases
-
-
-def test_a_phase_is_the_largest_nominal_arrival():
-    a, b, c = BaseNode("a", 100, delay=0.002), BaseNode("b", 100, delay=0.005), BaseNode("c", 100, delay=0.001)
-    c.connect(a, delay=0.001)
-    c.connect(b, delay=0.004, blocking=True)
-    assert (a.phase, c.phase, c.phase_output) == (0.0, 0.009, pytest.approx(0.01))
-
-
-def test_a_skipped_input_does_not_count_and_a_diamond_takes_its_longer_side():
-    top, left, right, end = (BaseNode(n, 50, delay=d) for n, d in [("t", 0.001), ("l", 0.002), ("r", 0.01), ("e", 0.0)])
-    for side in (left, right):
-        side.connect(top)
-        end.connect(side)
-    top.connect(end, skip=True, delay=0.5)
-    assert end.phase == pytest.approx(0.011)
-    assert top.phase == 0.0
-
-
 def test_a_loop_is_named():
     a, b, c = (BaseNode(n, 10) for n in "abc")
     a.connect(b)
@@ -63,9 +34,6 @@ def test_a_loop_is_named():
     assert "skip=True" in (e.value.hint or "")
 
 
-# Rule 2: the schedule
-
-
 def test_slots_are_rounded_one_by_one_so_that_errors_do_not_add_up():
     node = BaseNode("a", 30)
     assert slot(node, np.arange(4)).tolist() == [0, 33_333, 66_667, 100_000]
@@ -74,39 +42,11 @@ def test_slots_are_rounded_one_by_one_so_that_errors_do_not_add_up():
     assert slot(BaseNode("b", 384), np.array([3, 9])).tolist() == [7813, 23438]
 
 
-# Rule 3: starts
-
-
 def test_advance_needs_a_blocking_input():
     sender, reader = BaseNode("s", 10), BaseNode("r", 10, advance=True)
     reader.connect(sender)
     with pytest.raises(UsageError, match="needs a blocking input"):
         draw(by_name(sender, reader), 1.0)
-
-
-# Rule 6: what a step consumes
-
-
-def consumed(reader_options, travel=(0, 0, 0, 0), rates=(100, 100), busy=(0,) * 4):
-    sender, reader = BaseNode("s", rates[0]), BaseNode("r", rates[1])
-    reader.connect(sender, **reader_options)
-    _, timeline = starts(reader, *busy, senders=[sender], busy={"s": (0,) * len(travel)}, travel={("r", "s"): travel})
-    return timeline.edges["r", "s"].seq_in[0].tolist()
-
-
-def test_a_message_that_arrives_at_the_start_is_read_at_once_or_with_skip_at_the_next_step():
-    assert consumed({}) == [0, 1, 2, 3]
-    assert consumed({"skip": True}) == [1, 2, 3, -1]
-    assert consumed({}, travel=(0.001, 0, 0, 0)) == [1, 1, 2, 3]
-
-
-def test_blocking_at_equal_rates_takes_two_messages_first_and_one_later():
-    sender, reader = BaseNode("s", 100), BaseNode("r", 100)
-    connection = reader.connect(sender, blocking=True, delay=0.01)
-    assert quota(connection, np.arange(4)).tolist() == [2, 3, 4, 5]
-    reader.inputs.clear()
-    connection = reader.connect(sender, blocking=True, delay=0.01, skip=True)
-    assert quota(connection, np.arange(4)).tolist() == [0, 1, 2, 3]  # skipped: no phase, and strict
 
 
 rates = st.one_of(st.sampled_from([1, 3, 7, 30, 48, 60, 64, 100, 384, 1000]), st.floats(0.5, 2000))
@@ -134,9 +74,6 @@ def test_a_world_that_averages_takes_what_arrives_before_its_tick_ends():
     assert eligible(connection, np.array([0, end - 1, end])).tolist() == [1 - end, 0, 1]
 
 
-# All of them
-
-
 def test_a_recorded_sender_that_stops_leaves_its_blocking_reader_without_a_step():
     sender, reader = BaseNode("s", 100), BaseNode("r", 100, delay_dist=0.001)
     reader.connect(sender, blocking=True)
@@ -161,13 +98,11 @@ def test_what_is_recorded_stays_and_the_rest_is_drawn():
         np.testing.assert_array_equal(again.vertices[name].start, full.vertices[name].start)
 
 
-def test_too_short_a_duration_and_a_missing_sender_are_errors():
+def test_too_short_a_duration_is_an_error():
     sender, reader = BaseNode("s", 10, delay=0.5), BaseNode("r", 10)
     reader.connect(sender)
     with pytest.raises(UsageError, match="'r' makes no step within"):
         draw(by_name(sender, reader), 0.3)
-    with pytest.raises(UsageError, match="listens to 's', which is not in the graph"):
-        draw(by_name(reader), 1.0)
 
 
 def test_the_same_seed_draws_the_same_and_episodes_differ():
@@ -191,22 +126,3 @@ def test_the_rules_by_the_letter_give_the_same_timeline(seed):
             assert v.end[episode, :count].tolist() == reference.ends[name][:count]
         for key, seq_in in reference.seq_in.items():
             assert timeline.edges[key].seq_in[episode][: len(seq_in)].tolist() == seq_in
-
-
-@settings(max_examples=60)
-@given(st.integers(0, 10**6))
-def test_messages_arrive_in_order_after_they_were_sent_and_are_read_once(seed):
-    nodes = random_graph(seed)
-    timeline = draw(nodes, 0.4, 2, seed)
-    for (name, _), edge in timeline.edges.items():
-        sender, reader = timeline.vertices[edge.sender], timeline.vertices[name]
-        for e in range(2):
-            sent, got = sender.count[e], edge.seq_in[e]
-            used = np.flatnonzero(got >= 0)
-            assert (np.diff(edge.received[e]) >= 0).all()
-            assert (edge.received[e] >= sender.end[e]).all()
-            assert used.tolist() == list(range(len(used)))  # no message is left out
-            assert len(used) <= sent
-            assert (np.diff(got[used]) >= 0).all()
-            assert (got[used] < reader.count[e]).all()
-            assert (edge.received[e][used] <= reader.start[e][got[used]]).all()  # nothing from the future
