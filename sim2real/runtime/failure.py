@@ -46,4 +46,5 @@ def noted(error: BaseException) -> Iterator[None]:
         yield
     except Exception as other:
         if other is not error:
-            error.add_note(f"then: {type(other).__name__}: {other}")
+            for note in (f"then: {type(other).__name__}: {other}", *getattr(other, "__notes__", ())):
+                error.add_note(note)

@@ -17,6 +17,7 @@ from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph import Jitter, Scheduling
 from sim2real.graph.episode import MemoryRecorder
 from sim2real.runtime import clock as runtime_clock
+from sim2real.runtime import virtual
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import MonotonicClock, realtime
 
@@ -266,3 +267,36 @@ def test_episodes_leave_the_interpreter_as_it_was(clock):
         assert gc.collect() < 100, "steps leave cyclic garbage"
     assert gc.isenabled()
     assert sys.getswitchinterval() == before
+
+
+def test_all_nodes_make_their_steps_and_nobody_waits(clock):
+    sensor, agent = pair()
+    with AsyncGraph([sensor, agent], agent, clock) as graph:
+        graph.start(graph.init(KEY))
+        graph.run_for(60.0)
+        statistics = graph.statistics()
+    for node in (sensor, agent):
+        assert statistics[node.name].steps == pytest.approx(60.0 * node.rate, abs=1)
+        assert statistics[node.name].overruns == 0
+
+
+def test_a_step_that_never_returns_ends_the_graph(clock, monkeypatch):
+    monkeypatch.setattr(virtual, "_HANGS_S", 0.05)
+    release = threading.Event()
+
+    class Hangs(Plain):
+        def step(self, step_state):
+            if step_state.seq == 5:
+                release.wait()
+            return super().step(step_state)
+
+    sensor, agent = pair(Hangs)
+    graph = AsyncGraph([sensor, agent], agent, clock)
+    graph.start(graph.init(KEY))
+    graph.run_for(5.0)
+    try:
+        with pytest.raises(Sim2RealError, match="'sensor' is still in its step 5"):
+            graph.stop()
+        assert "stop" in sensor.calls
+    finally:
+        release.set()

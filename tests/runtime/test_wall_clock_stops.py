@@ -102,20 +102,28 @@ def step_many(graph, gs):
         gs, ss = graph.step(gs, ss, Value(x=0))
 
 
+def ended(clock, nodes, match, how="run_for", kind=Sim2RealError, **options):
+    """Run a graph until it ends with an error; return graph and error. Each node was stopped, or never started."""
+    graph = AsyncGraph(nodes, nodes[1], clock, **options)
+    with pytest.raises(kind, match=match) as caught:
+        run_until_it_breaks(graph, graph.init(KEY), how)
+    assert all(node.calls in WHOLE for node in nodes)
+    graph.stop()  # it is raised once
+    assert not graph.running
+    assert gone(clock)
+    return graph, caught.value
+
+
 @pytest.mark.parametrize("how", ["run_for", "wait", "step", "stop", "reset"])
 def test_an_exception_stops_the_graph_and_reaches_the_caller(clock, how):
     sensor, agent = pair(Breaks)
-    slow = Plain("slow", 1)
-    graph = AsyncGraph([sensor, agent, slow], agent, clock)
-    gs = graph.init(KEY)
-    with pytest.raises(NodeFailed, match=r"node 'sensor' failed in its step 5: KeyError: 'gone'") as caught:
-        run_until_it_breaks(graph, gs, how)
-    assert caught.value.node == "sensor"
-    assert isinstance(caught.value.__cause__, KeyError)
-    assert [n.calls for n in (sensor, agent, slow)] == [["startup", "stop"]] * 3
-    graph.stop()  # it is raised once
-    assert not graph.running
-    graph.start(gs)
+    nodes = sensor, agent, Plain("slow", 1)
+    match = r"node 'sensor' failed in its step 5: KeyError: 'gone'"
+    graph, error = ended(clock, nodes, match, how, NodeFailed)
+    assert error.node == "sensor"
+    assert isinstance(error.__cause__, KeyError)
+    assert [n.calls for n in nodes] == [["startup", "stop"]] * 3
+    graph.start(graph.init(KEY))
     graph.stop()
 
 
@@ -126,44 +134,27 @@ class UnreadableError(Exception):
 
 @pytest.mark.parametrize("error", [UnreadableError(), SystemExit(1), MemoryError(), SafetyStop("too hot")], ids=repr)
 def test_any_exception_of_a_step_ends_with_all_nodes_stopped(clock, error):
-    sensor, agent = pair(type("Fails", (Breaks,), {"error": error}))
-    graph = AsyncGraph([sensor, agent], agent, clock)
-    with pytest.raises(Sim2RealError) as caught:
-        run_until_it_breaks(graph, graph.init(KEY), "run_for")
-    assert [sensor.calls, agent.calls] == [["startup", "stop"]] * 2
+    nodes = pair(type("Fails", (Breaks,), {"error": error}))
+    _, found = ended(clock, nodes, None)
+    assert [n.calls for n in nodes] == [["startup", "stop"]] * 2
     if isinstance(error, SafetyStop):  # the project's own errors keep their type
-        assert caught.value is error
+        assert found is error
         assert "node 'sensor', step 5" in error.__notes__
     else:
-        assert caught.value.__cause__ is error
+        assert found.__cause__ is error
 
 
-@pytest.mark.parametrize("call", ["start", "step", "message"])
-def test_a_recorder_that_fails_stops_the_graph(clock, call):
+@pytest.mark.parametrize("call", ["start", "step", "message", "watchdog"])
+def test_a_recorder_or_a_watchdog_that_fails_stops_the_graph(clock, call, monkeypatch):
     class Full(MemoryRecorder):
         pass
 
     def full(*_):
         raise OSError("disk full")
 
-    setattr(Full, call, full)
-    sensor, agent = pair()
-    graph = AsyncGraph([sensor, agent], agent, clock, recorder=Full())
-    with pytest.raises((OSError, Sim2RealError), match="disk full"):
-        run_until_it_breaks(graph, graph.init(KEY), "run_for")
-    assert [sensor.calls, agent.calls] == [["startup", "stop"]] * 2
-    graph.stop()
-    assert gone(clock)
-
-
-def test_a_watchdog_that_fails_stops_the_graph(clock, monkeypatch):
-    monkeypatch.setattr(Watchdog, "_look", lambda *_: 1 / 0)
-    sensor, agent = pair()
-    graph = AsyncGraph([sensor, agent], agent, clock)
-    with pytest.raises(Sim2RealError, match="watchdog"):
-        run_until_it_breaks(graph, graph.init(KEY), "run_for")
-    assert sensor.calls in WHOLE
-    assert agent.calls in WHOLE
+    monkeypatch.setattr(*((Watchdog, "_look") if call == "watchdog" else (Full, call)), full, raising=False)
+    match = "watchdog" if call == "watchdog" else "disk full"
+    ended(clock, pair(), match, kind=(OSError, Sim2RealError), recorder=Full())
 
 
 def test_a_failure_that_comes_while_a_call_looks_for_one_is_raised(clock, monkeypatch):
@@ -185,7 +176,7 @@ def test_a_failure_that_comes_while_a_call_looks_for_one_is_raised(clock, monkey
     assert not graph.running
 
 
-def test_every_node_is_stopped_although_one_stop_fails(clock):
+def test_every_node_is_stopped_although_one_stop_fails_which_does_not_hide_why_a_block_is_left(clock):
     class BadStop(Plain):
         def stop(self, timeout=None):
             super().stop(timeout)
@@ -196,15 +187,21 @@ def test_every_node_is_stopped_although_one_stop_fails(clock):
             super().stop(timeout)
             return False
 
+    def interrupted():
+        with graph:
+            graph.start(graph.init(KEY))
+            raise KeyboardInterrupt
+
     nodes = [BadStop("a", 50), Plain("b", 50), StopsNot("c", 50)]
     graph = AsyncGraph(nodes, nodes[0], clock)
     graph.start(graph.init(KEY))
-    with pytest.raises(Sim2RealError) as caught:
-        graph.stop()
-    text = str(caught.value) + "".join(getattr(caught.value, "__notes__", []))
-    assert "OSError: port" in text
-    assert "'c' did not succeed" in text
-    assert all(n.calls == ["startup", "stop"] for n in nodes)
+    for call, kind in ((graph.stop, Sim2RealError), (interrupted, KeyboardInterrupt)):
+        with pytest.raises(kind) as caught:
+            call()
+        text = str(caught.value) + "".join(getattr(caught.value, "__notes__", []))
+        assert "OSError: port" in text
+        assert "'c' did not succeed" in text
+    assert all(n.calls == ["startup", "stop"] * 2 for n in nodes)
 
 
 @pytest.mark.parametrize(("seconds", "match"), [(0.0, "startup of node 'sensor'"), (20.0, "'sensor' has not finished")])
@@ -527,23 +524,6 @@ def test_ctrl_c_ends_a_startup_that_hangs(clock):
     assert hanging.calls == ["stop"]
     assert gone(clock)
     assert hanging.calls == ["stop", "startup", "stop"]
-
-
-def test_leaving_the_graph_does_not_hide_why(clock):
-    class BadStop(Plain):
-        def stop(self, timeout=None):
-            raise OSError("port")
-
-    node = BadStop("a", 50)
-
-    def interrupted():
-        with AsyncGraph([node], node, clock) as graph:
-            graph.start(graph.init(KEY))
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt) as caught:
-        interrupted()
-    assert "OSError: port" in "".join(caught.value.__notes__)
 
 
 def test_what_fails_on_the_way_out_becomes_a_note():
