@@ -85,6 +85,10 @@ def assert_rules_explain(episode, nodes):
     for n, vertex in recorded.vertices.items():
         for field in ("start", "end", "count"):
             np.testing.assert_array_equal(getattr(derived.vertices[n], field), getattr(vertex, field), err_msg=n)
+    for n, steps in episode.steps.items():
+        if not any(c.blocking for c in nodes[n].inputs.values()):
+            due = np.maximum(steps.scheduled + steps.drift, np.concatenate([[0], steps.end[:-1]]))
+            np.testing.assert_array_equal(steps.start, due, err_msg=n)
     for (n, i), edge in recorded.edges.items():
         sender = nodes[n].inputs[i].output_node.name
         np.testing.assert_array_equal(episode.messages[n, i].seq_out, np.arange(len(episode.steps[sender])))

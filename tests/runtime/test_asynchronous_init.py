@@ -61,33 +61,23 @@ def test_order_params_and_delays():
         with pytest.raises(UsageError, match="names z, not in the graph"):
             init_graph_state(nodes, "a", KEY, **given)
 
-
-def test_can_be_mapped_and_traced():
-    nodes = graph()
-    keys = jax.random.split(KEY, 4)
-    states = jax.jit(jax.vmap(lambda k: init_graph_state(nodes, "a", k)))(keys)
-    assert states.aux[OUTPUTS]["a"].x.shape == (4,)
-    one = init_graph_state(nodes, "a", keys[2])
+    states = jax.jit(jax.vmap(lambda k: init_graph_state(nodes, "a", k)))(jax.random.split(KEY, 4))
+    one = init_graph_state(nodes, "a", jax.random.split(KEY, 4)[2])
     np.testing.assert_array_equal(states.aux[OUTPUTS]["a"].x[2], one.aux[OUTPUTS]["a"].x)
 
 
-def test_collect_checks_the_graph():
+def test_what_is_no_graph_is_refused():
     nodes = graph()
     assert set(collect([nodes["a"], nodes["c"]], nodes["b"])) == {"a", "b", "c"}
-    with pytest.raises(UsageError, match="the key 'x' stands for"):
-        collect({"x": nodes["a"]}, nodes["a"])
-    lone = Jitted("lone", 10)
+    lone, eager = Jitted("lone", 10), Plain("eager", 10, advance=True)
     lone.connect(lone)
-    with pytest.raises(UsageError, match="algebraic loop"):
-        collect([lone], lone)
-    eager = Plain("eager", 10, advance=True)
-    with pytest.raises(UsageError, match="advance=True"):
-        collect([eager], eager)
+    for args, words in (
+        (({"x": nodes["a"]}, nodes["a"]), "the key 'x' stands for"),
+        (([lone], lone), "algebraic loop"),
+        (([eager], eager), "advance=True"),
+        *(((nodes, wrong), "the supervisor must be one of the nodes") for wrong in ("a", None, ["a", "b"])),
+    ):
+        with pytest.raises(UsageError, match=words):
+            collect(*args)
     with pytest.raises(UsageError, match="no default output"):
         default_output(init_graph_state({"a": nodes["a"]}, "a", KEY), "b")
-
-
-@pytest.mark.parametrize("wrong", ["a", None, ["a", "b"]])
-def test_the_supervisor_is_one_node(wrong):
-    with pytest.raises(UsageError, match="the supervisor must be one of the nodes"):
-        collect(graph(), wrong)

@@ -1,6 +1,7 @@
 """The folder of compiled programs: where it is, what it holds, and that nothing about it is ever an error."""
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -55,19 +56,16 @@ def test_a_second_process_finds_the_programs_of_the_first(tmp_path):
     assert run(environment) == (folder, misses, 0)
 
 
-def test_off_keeps_nothing(alone, monkeypatch):
+def test_the_variable_moves_the_folder_or_switches_it_off_and_the_users_jax_wins(alone, monkeypatch):
     monkeypatch.setenv("SIM2REAL_CACHE", "off")
     assert cache.enable() is None
     assert "JAX_COMPILATION_CACHE_DIR" not in os.environ
-    assert not (alone / "xdg").exists()
-
-
-def test_the_variable_moves_the_folder_and_the_users_jax_wins(alone, monkeypatch):
     monkeypatch.setenv("SIM2REAL_CACHE", str(alone / "variable"))
     assert cache.enable().is_relative_to(alone / "variable")
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "mine")
     assert cache.enable() is None
     assert os.environ["JAX_COMPILATION_CACHE_DIR"] == "mine"
+    assert not (alone / "xdg").exists()
 
 
 def test_other_processors_have_a_folder_of_their_own(alone, monkeypatch):
@@ -79,23 +77,18 @@ def test_other_processors_have_a_folder_of_their_own(alone, monkeypatch):
     assert cache.location().parent == here.parent
 
 
-def test_a_home_that_cannot_be_written_is_no_error(alone, monkeypatch):
-    (alone / "xdg").write_text("a file where the folder would be")
-    assert cache.enable() is None
-    assert "JAX_COMPILATION_CACHE_DIR" not in os.environ
-
-
-def test_a_folder_without_permission_is_no_error(alone, monkeypatch):
+def test_a_home_that_cannot_be_written_is_no_error_but_a_file_in_the_variable_is(alone, monkeypatch):
     def refused(*_args, **_options):
         raise PermissionError("read-only file system")
 
-    monkeypatch.setattr(cache.tempfile, "TemporaryFile", refused)  # the tests may run as root, who may write everywhere
+    with monkeypatch.context() as patch:  # the tests may run as root, who may write everywhere
+        patch.setattr(cache.tempfile, "TemporaryFile", refused)
+        assert cache.enable() is None
+    shutil.rmtree(alone / "xdg", ignore_errors=True)
+    (alone / "xdg").write_text("a file where the folder would be")
     assert cache.enable() is None
-
-
-def test_a_file_is_refused_as_a_folder(alone, monkeypatch):
-    (alone / "file").touch()
-    monkeypatch.setenv("SIM2REAL_CACHE", str(alone / "file"))
+    assert "JAX_COMPILATION_CACHE_DIR" not in os.environ
+    monkeypatch.setenv("SIM2REAL_CACHE", str(alone / "xdg"))
     with pytest.raises(UsageError, match="is no folder"):
         cache.location()
 
