@@ -117,3 +117,28 @@ class Sign(TrainingEnvironment):
         new = {**state, "row": state["row"] + 1, "said": said}
         no = jnp.bool_(False)
         return Step(new, jnp.zeros(2), jnp.where(late, -error, 0.0), no, new["row"] >= 6, ~no, {"success": said})
+
+
+class Growing(Bandit):
+    """Rewards with the share of the differences that the episode was started with."""
+
+    curriculum = (0.2, 0.7)
+
+    def reset(self, key, width=None):
+        width = jnp.float32(self.curriculum[1]) if width is None else width
+        state, observation = super().reset(key)
+        return {**state, "width": width}, observation
+
+    def step(self, state, action, key):
+        made = super().step(state, action, key)
+        return made._replace(reward=state["width"] + 0.0 * jnp.sum(action))
+
+
+class Following(Growing):
+    """Episodes are successful as long as they have less than half of the differences."""
+
+    follow = 0.5
+
+    def step(self, state, action, key):
+        made = super().step(state, action, key)
+        return made._replace(metrics={**made.metrics, "success": (state["width"] < 0.5).astype(jnp.float32)})

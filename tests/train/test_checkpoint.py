@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from environments import Bandit, Constant
+from environments import Bandit, Constant, Following, Growing, Sign
 
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.training.config import PPOConfig
@@ -19,31 +19,33 @@ CONFIG = PPOConfig(
 KEY = jax.random.key(3)
 
 
-def interrupted(path, after, env=None, config=CONFIG):
+def interrupted(path, after, env, config):
     def stop(progress):
         if progress.evaluation == after:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(env or Bandit(), config, KEY, stop, checkpoint=path)
-
-
-@pytest.fixture(scope="module")
-def whole():
-    return train(Bandit(), CONFIG, KEY)
+        train(env, config, KEY, stop, checkpoint=path)
 
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory):
     path = tmp_path_factory.mktemp("checkpoint") / "checkpoint.safetensors"
-    interrupted(path, 2)
+    interrupted(path, 2, Bandit(), CONFIG)
     return path
 
 
 @pytest.mark.night
-def test_what_is_resumed_ends_as_if_it_had_never_been_interrupted(whole, saved, tmp_path):
-    seen = []
-    found = train(Bandit(), CONFIG, KEY, seen.append, checkpoint=tmp_path / "next", resume=saved)
+@pytest.mark.parametrize(
+    ("env", "change"),
+    [(Bandit(), {}), (Sign(), {"network": "gru", "eval_steps": 8}), (Growing(), {}), (Following(), {})],
+    ids=["bandit", "memory in the middle of episodes", "differences that grow", "differences that follow success"],
+)
+def test_what_is_resumed_ends_as_if_it_had_never_been_interrupted(env, change, tmp_path):
+    config, seen = dataclasses.replace(CONFIG, **change), []
+    whole = train(env, config, KEY)
+    interrupted(tmp_path / "first", 2, env, config)
+    found = train(env, config, KEY, seen.append, checkpoint=tmp_path / "next", resume=tmp_path / "first")
     assert [progress.evaluation for progress in seen] == [1, 2, 3, 4]
     jax.tree.map(np.testing.assert_array_equal, (found.policies, found.best), (whole.policies, whole.best))
     assert found.history.keys() == whole.history.keys()
@@ -52,7 +54,7 @@ def test_what_is_resumed_ends_as_if_it_had_never_been_interrupted(whole, saved, 
     assert found.best_seed == whole.best_seed
     assert found.env_steps.tolist() == whole.env_steps.tolist()
     assert (np.diff(found.elapsed_s) > 0).all()
-    again = train(Bandit(), CONFIG, KEY, resume=tmp_path / "next")
+    again = train(env, config, KEY, resume=tmp_path / "next")
     np.testing.assert_array_equal(again.best.log_std, whole.best.log_std)
 
 
@@ -91,8 +93,5 @@ def test_any_damage_is_noticed_before_training_goes_on(saved, tmp_path):
         file.write_bytes(bent)
         with pytest.raises(Sim2RealError, match=r"cannot continue from .*bent[\s\S]*hint: train again"):
             load_checkpoint(file, identity, None, None)
-
-
-def test_a_file_that_is_missing_is_named(tmp_path):
     with pytest.raises(Sim2RealError, match=r"cannot continue from .*missing[\s\S]*hint: train again"):
-        load_checkpoint(tmp_path / "missing", TrainingIdentity({}, [], ""), None, None)
+        load_checkpoint(tmp_path / "missing", identity, None, None)

@@ -13,8 +13,8 @@ from sim2real.composer import mjcf
 from sim2real.composer.observation.observable import MJCFFeature
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState
-from sim2real.training.environment.composed import TaskEnvironment, TaskState
-from sim2real.training.environment.graph_environment import GraphEnvironment, _require_reward
+from sim2real.training.environment.composed import TaskEnvironment
+from sim2real.training.environment.graph_environment import _require_reward
 from sim2real.training.environment.protocol import check_environment
 
 CART = """
@@ -31,115 +31,53 @@ def cart(limits):
     return composer.MjxEnvironment(task, time_limit=0.1)
 
 
-def test_a_task_keeps_the_protocol():
-    env = TaskEnvironment(cart('ctrlrange="-2 1" ctrllimited="true"'))
-    check_environment(env)
-    assert (env.observation_size, env.action_low.tolist(), env.action_high.tolist()) == (2, [-2], [1])
+def test_actions_without_bounds_are_refused():
     with pytest.raises(UsageError, match="PPO's actions are vectors with bounds"):
         TaskEnvironment(cart(""))
 
 
-@struct.dataclass
-class State:
-    done: jax.Array
-    truncated: jax.Array
-    reward: jax.Array
-    observation: dict
-    terms: dict = struct.field(default_factory=dict)
-
-
-@pytest.mark.parametrize(("done", "truncated"), [(True, True), (True, False), (False, False)])
-def test_a_time_limit_is_no_end(done, truncated):
-    state = State(jnp.array(done), jnp.array(truncated), jnp.float32(3), {"b": jnp.ones((1, 2)), "a": jnp.zeros(())})
-    spec = SimpleNamespace(shape=(1,), minimum=-1.0, maximum=1.0)
-    env = TaskEnvironment(
-        SimpleNamespace(observation_spec=lambda: state.observation, action_spec=lambda: spec, step=lambda *_: state)
-    )
-    step = env.step(TaskState(state, {}), jnp.zeros(1), jax.random.key(0))
-    assert (bool(step.terminated), bool(step.truncated)) == (done and not truncated, truncated)
-    assert step.observation.tolist() == [1, 1, 0]
-
-
-@pytest.mark.parametrize("ends", [(False, False), (True, False), (False, True)])
-def test_a_composed_task_ends_the_episode_of_its_graph(ends):
-    state = SimpleNamespace(step=jnp.int32(1), eps=jnp.int32(0), state={"world": None, "other": None})
-    heard = SimpleNamespace(seq=jnp.int32(0))
-    nodes = {"world": SimpleNamespace(ends=lambda state: tuple(map(jnp.bool_, ends))), "other": SimpleNamespace()}
-    graph = SimpleNamespace(
-        nodes=nodes,
-        rows=9,
-        last_row=lambda steps: steps - 1,
-        advance=lambda *_, **__: state,
-        observe=lambda gs, **_: (gs, heard, None),
-        data=None,
-        with_data=lambda _: graph,
-    )
-    task = SimpleNamespace(
-        observation_size=1,
-        action_low=np.zeros(1),
-        action_high=np.ones(1),
-        act=lambda step_state, action: (step_state, None),
-        observe=lambda step_state: jnp.zeros(1),
-        reward=lambda gs, action: jnp.float32(0),
-        success=lambda gs: jnp.bool_(False),
-        terminated=lambda gs: jnp.bool_(False),
-        privileged=None,
-    )
-    env = GraphEnvironment(graph, task, np.array([9]))
-    before = SimpleNamespace(step_state=heard, graph=state, total=0.0, good=0.0, width=None)
-    step = env._step(env.data, before, jnp.zeros(1), jax.random.key(0))
-    assert (bool(step.terminated), bool(step.truncated)) == ends
-
-
-def test_what_is_over_stays_over(monkeypatch):
-    world = composer.ComposedWorld.__new__(composer.ComposedWorld)
-    after = State(jnp.array(False), jnp.array(False), jnp.float32(0), {})
-    world.environment = SimpleNamespace(step=lambda *_: after)
-    world.input_name, world.field = "actuator", "action"
-    monkeypatch.setattr(world, "_model", lambda params: None)
-    given = {"actuator": SimpleNamespace(data=SimpleNamespace(action=jnp.zeros((1, 1))))}
-    for truncated in (False, True):
-        state = State(jnp.array(True), jnp.array(truncated), jnp.float32(0), {})
-        made = SimpleNamespace(
-            state=state, inputs=given, params=None, replace=lambda state: SimpleNamespace(state=state)
-        )
-        new, _ = world.step(made)
-        assert tuple(map(bool, world.ends(new.state))) == (not truncated, truncated)
-
-
 class Named(composer.NullTask):
-    """A cart of random friction, whose reward has two terms."""
+    """A cart of random friction that is to go 3.5 mm to the right, whose reward has two terms."""
+
+    @property
+    def rail(self):
+        return self.root_entity.mjcf_model.find("joint", "rail")
 
     def initialize_episode(self, physics, random_state):
-        rail = self.root_entity.mjcf_model.find("joint", "rail")
-        physics.bind(rail).damping = random_state.uniform(0.5, 2.0)
+        physics.bind(self.rail).damping = random_state.uniform(0.5, 2.0)
 
     def get_reward(self, physics):
-        rail = self.root_entity.mjcf_model.find("joint", "rail")
-        return {"far": -(physics.bind(rail).qpos[0] ** 2), "alive": 0.25}
+        return {"far": -(physics.bind(self.rail).qpos[0] ** 2), "alive": 0.25}
+
+    def should_terminate_episode(self, physics):
+        return physics.bind(self.rail).qpos[0] > 0.0035
 
 
 @pytest.fixture(scope="module")
 def named():
     task = Named(cart('ctrlrange="-2 1" ctrllimited="true"').task.root_entity)
+    task.set_timesteps(0.01, 0.01)
     return TaskEnvironment(composer.MjxEnvironment(task, time_limit=0.1))
 
 
-def test_terms_of_a_reward_are_summed_by_name(named):
+@pytest.mark.parametrize(("force", "rows", "truncated"), [(0.0, 10, True), (1.0, 6, False)])
+def test_a_task_keeps_the_protocol_and_sums_terms_by_name(named, force, rows, truncated):
+    """A time limit is no end: the value of what follows counts."""
     check_environment(named)
+    assert (named.observation_size, named.action_low.tolist(), named.action_high.tolist()) == (2, [-2], [1])
     step = jax.jit(named.step)
     state, _ = jax.jit(named.reset)(jax.random.key(0))
-    rewards = []
-    for i in range(3):
-        made = step(state, jnp.ones(1), jax.random.key(i))
-        state, rewards = made.state, [*rewards, float(made.reward)]
-    metrics = {name: float(value) for name, value in made.metrics.items()}
+    assert set(map(float, state.terms.values())) == {0.0}
+    made = [step(state, jnp.full(1, force), jax.random.key(0))]
+    while not (made[-1].terminated or made[-1].truncated):
+        made.append(step(made[-1].state, jnp.full(1, force), jax.random.key(0)))
+    assert (len(made), bool(made[-1].truncated), bool(made[-1].terminated)) == (rows, truncated, not truncated)
+    metrics = {name: float(value) for name, value in made[-1].metrics.items()}
     assert metrics.keys() == {"reward/far", "reward/alive"}
-    assert metrics["reward/alive"] == pytest.approx(0.75)
-    assert sum(metrics.values()) == pytest.approx(sum(rewards), rel=1e-5)
-    assert metrics["reward/far"] < 0.0
-    again = jax.jit(named.reset)(jax.random.key(1))[0]
-    assert set(map(float, again.terms.values())) == {0.0}
+    assert metrics["reward/alive"] == pytest.approx(0.25 * rows)
+    assert sum(metrics.values()) == pytest.approx(sum(float(m.reward) for m in made), rel=1e-5)
+    position = np.array([float(m.observation[0]) for m in made])
+    assert metrics["reward/far"] == pytest.approx(-np.sum(position**2), rel=1e-4, abs=1e-12)
 
 
 def test_the_truth_of_a_composed_task_has_what_its_hooks_drew(named):
@@ -149,6 +87,29 @@ def test_the_truth_of_a_composed_task_has_what_its_hooks_drew(named):
     np.testing.assert_array_equal(one[:2], 0.0)
     assert one[-1] != other[-1]
     assert 0.5 <= one[-1] <= 2.0
+
+
+@struct.dataclass
+class State:
+    done: jax.Array
+    truncated: jax.Array
+    observation: dict = struct.field(default_factory=dict)
+
+
+def test_what_is_over_stays_over(monkeypatch):
+    world = composer.ComposedWorld.__new__(composer.ComposedWorld)
+    after = State(jnp.array(False), jnp.array(False))
+    world.environment = SimpleNamespace(step=lambda *_: after)
+    world.input_name, world.field = "actuator", "action"
+    monkeypatch.setattr(world, "_model", lambda params: None)
+    given = {"actuator": SimpleNamespace(data=SimpleNamespace(action=jnp.zeros((1, 1))))}
+    for truncated in (False, True):
+        state = State(jnp.array(True), jnp.array(truncated))
+        made = SimpleNamespace(
+            state=state, inputs=given, params=None, replace=lambda state: SimpleNamespace(state=state)
+        )
+        new, _ = world.step(made)
+        assert tuple(map(bool, world.ends(new.state))) == (not truncated, truncated)
 
 
 @struct.dataclass

@@ -74,21 +74,14 @@ def test_eight_devices_learn_what_one_learns(found):
     assert found["mesh"] == {"seeds": 4, "copies": 2}, "two seeds, each with two settings"
     for one, eight in zip(found["1"], found["8"], strict=True):
         np.testing.assert_allclose(eight, one, rtol=1e-3, atol=1e-4)
-
-
-@pytest.mark.night
-def test_each_device_computes_its_part_of_a_minibatch(found):
     whole = 48 // 4 * 5
-    assert whole // 2 in found["rows"]
+    assert whole // 2 in found["rows"], "each device computes its part of a minibatch"
     assert whole not in found["rows"]
 
 
-def test_devices_that_are_not_there_are_refused():
+def test_devices_that_are_not_there_or_cannot_divide_the_copies_are_refused(monkeypatch):
     with pytest.raises(UsageError, match="devices=64, but JAX finds 1 on this host"):
         mesh_of(PPOConfig(devices=64))
-
-
-def test_copies_that_cannot_be_divided_are_refused(monkeypatch):
     monkeypatch.setattr("jax.local_devices", lambda: [SimpleNamespace(device_kind="cpu")] * 8)
     with pytest.raises(UsageError, match="8 devices cannot divide 2 seeds of 6 copies: 4 devices a seed"):
         mesh_of(PPOConfig(devices=8, num_seeds=2, num_envs=6, minibatches=2))

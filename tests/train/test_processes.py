@@ -108,21 +108,9 @@ def test_two_processes_learn_what_one_learns_and_go_on_where_they_were_interrupt
         assert len(process["found"]) == len(expected)
         for found, own in zip(process["found"], expected, strict=True):
             np.testing.assert_allclose(found, np.ravel(own), rtol=1e-3, atol=1e-4)
-
-
-@pytest.mark.night
-def test_the_first_process_alone_leads_and_writes(told):
     assert [(t["leads"], t["wrote"]) for t in told] == [(True, True), (False, False)]
-
-
-@pytest.mark.night
-def test_processes_that_were_started_differently_say_in_what(told):
     for process in told:
         assert "the processes were not started alike: clip = 0.1 in process 0 and 0.2 in process 1" in process["differ"]
-
-
-@pytest.mark.night
-def test_who_loses_another_process_says_so(told):
     assert told[0]["lost"].startswith("process 0 of 2 lost another one of this training: ")
     assert "--resume newest" in told[0]["lost"]
 
@@ -187,9 +175,6 @@ def test_processes_that_cannot_be_are_refused(settings, said):
 def test_one_process_joins_nobody_and_leads():
     join(HostsConfig())
     assert leads()
-
-
-def test_without_a_launcher_nothing_is_found():
     jax.devices()
     with pytest.raises(UsageError, match="the processes cannot be joined"):
-        join(HostsConfig(found=True))
+        join(HostsConfig(found=True))  # without a launcher

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from environments import Bandit
+from environments import Following, Growing
 
 from sim2real.artifacts.episodes import Episodes
 from sim2real.errors import UsageError
@@ -19,7 +19,6 @@ from sim2real.stages.load import load_robot
 from sim2real.stages.train.bundle import training_summary
 from sim2real.training.config import PPOConfig
 from sim2real.training.environment.graph_environment import GraphEnvironment
-from sim2real.training.environment.protocol import Step
 from sim2real.training.environment.pushes import Pushes
 from sim2real.training.environment.variation import VariationConfig
 from sim2real.training.ppo.trainer import Sweep, train
@@ -150,76 +149,25 @@ def test_a_share_of_all_differences_is_that_share_of_each(robot, loop, monkeypat
     np.testing.assert_allclose(last, 0.8)
 
 
-class Growing(Bandit):
-    """Rewards with the share of the differences that the episode was started with."""
-
-    curriculum = (0.2, 0.7)
-
-    def reset(self, key, width=None):
-        width = jnp.float32(self.curriculum[1]) if width is None else width
-        state, observation = super().reset(key)
-        return {**state, "width": width}, observation
-
-    def step(self, state, action, key):
-        made: Step = super().step(state, action, key)
-        return made._replace(reward=state["width"] + 0.0 * jnp.sum(action))
-
-
-@pytest.fixture(scope="module")
-def interrupted(tmp_path_factory):
-    """A training of six updates, its checkpoint after the third, and what was told."""
-    path = tmp_path_factory.mktemp("growing") / "checkpoint.safetensors"
-
-    def keep(progress):
-        if progress.evaluation == 1:
-            path.with_suffix(".first").write_bytes(path.read_bytes())
-
-    return train(Growing(), CONFIG, KEY, keep, checkpoint=path), path.with_suffix(".first")
-
-
 @pytest.mark.night
-def test_differences_grow_evenly_from_update_to_update(interrupted):
-    whole, _ = interrupted
+def test_differences_grow_evenly_from_update_to_update():
+    found = train(Growing(), CONFIG, KEY)
     widths = np.linspace(0.2, 0.7, CONFIG.updates)
     assert CONFIG.updates == 6
-    np.testing.assert_allclose(whole.history["width"][:, 0], widths[[2, 5]], rtol=1e-5)
+    np.testing.assert_allclose(found.history["width"][:, 0], widths[[2, 5]], rtol=1e-5)
     # A rollout's first rows belong to episodes that were started in the one before, one row each.
     before = np.concatenate([widths[:1], widths[:-1]])
     played = before / CONFIG.rollout_steps + widths * (1.0 - 1.0 / CONFIG.rollout_steps)
-    np.testing.assert_allclose(whole.history["reward"][:, 0], played.reshape(2, 3).mean(1), rtol=1e-5)
-    np.testing.assert_allclose(whole.history["return"], 0.7, rtol=1e-6, err_msg="evaluations have the last share")
+    np.testing.assert_allclose(found.history["reward"][:, 0], played.reshape(2, 3).mean(1), rtol=1e-5)
+    np.testing.assert_allclose(found.history["return"], 0.7, rtol=1e-6, err_msg="evaluations have the last share")
 
 
 @pytest.mark.night
-def test_what_grows_is_resumed_bit_for_bit(interrupted):
-    whole, path = interrupted
-    found = train(Growing(), CONFIG, KEY, resume=path)
-    jax.tree.map(np.testing.assert_array_equal, found.policies, whole.policies)
-    np.testing.assert_array_equal(found.history["reward"], whole.history["reward"])
-
-
-class Following(Growing):
-    """Episodes are successful as long as they have less than half of the differences."""
-
-    follow = 0.5
-
-    def step(self, state, action, key):
-        made = super().step(state, action, key)
-        return made._replace(metrics={**made.metrics, "success": (state["width"] < 0.5).astype(jnp.float32)})
-
-
-@pytest.mark.night
-def test_differences_that_follow_success_grow_while_it_is_high(tmp_path):
+def test_differences_that_follow_success_grow_while_it_is_high():
     """In a quarter of the updates from the first to the last share at most: by 1/3 of 0.5 each, and then they stay."""
     config = replace(CONFIG, total_steps=12 * 32, evaluations=12, num_envs=8)
     assert config.updates == 12
-    first = {}
-
-    def keep(progress):
-        if progress.evaluation == 3:
-            first["file"] = (tmp_path / "saved").read_bytes()
-
-    found = train(Following(), config, KEY, keep, checkpoint=tmp_path / "saved")
+    found = train(Following(), config, KEY)
     widths, step = found.history["width"][:, 0], 0.5 / 3
     np.testing.assert_allclose(widths[:2], [0.2 + step, 0.2 + 2 * step], rtol=1e-5)
     np.testing.assert_allclose(widths[2:], widths[1], rtol=1e-6, err_msg="no longer successful")
@@ -227,8 +175,3 @@ def test_differences_that_follow_success_grow_while_it_is_high(tmp_path):
     # The result reports how far it came.
     shown = training_summary(found, config, Sweep({}), Episodes((), curriculum=(0.2, 0.7), follow=0.5))
     assert shown["share reached"] == "0.53 of 0.7: success did not stay above 0.5"
-    # A training that was interrupted goes on at the share that it had reached.
-    (tmp_path / "first").write_bytes(first["file"])
-    again = train(Following(), config, KEY, resume=tmp_path / "first")
-    np.testing.assert_array_equal(again.history["width"], found.history["width"])
-    np.testing.assert_array_equal(again.history["reward"], found.history["reward"])
