@@ -67,14 +67,9 @@ def learnt():
 
 
 @pytest.mark.night
-def test_a_module_of_flax_is_trained(learnt):
-    assert learnt.history["success"][-1, 0] > 0.6
-    assert learnt.best.spec == NetworkSpec(f"{__name__}:Normalised")
-
-
-@pytest.mark.night
 def test_its_bundle_runs_without_jax_and_without_its_code(learnt, tmp_path):
     policy = learnt.best
+    assert learnt.history["success"][-1, 0] > 0.6
     folder = save_bundle(tmp_path, policy.to_weights(), CONTRACT, spec=policy.spec, graph=export_graph(policy))
     code = f"""
 import json, sys
@@ -94,6 +89,7 @@ assert not {{"jax", "flax", "onnx"}} & set(sys.modules)
 @pytest.mark.night
 def test_its_weights_make_the_same_policy(learnt):
     weights = learnt.best.to_weights()
+    assert learnt.best.spec == NetworkSpec(f"{__name__}:Normalised")
     again = Policy.from_weights(weights, learnt.best.spec)
     assert jax.tree.structure(again) == jax.tree.structure(learnt.best)
     np.testing.assert_array_equal(again.params["Dense_0"]["kernel"], weights["network.Dense_0.kernel"])
@@ -219,10 +215,6 @@ def test_what_cannot_be_trained_or_exported_is_refused_before(kind, message):
         make_network(kind, (8,), 3, 2)
 
 
-def test_a_value_function_need_not_be_exported():
-    assert make_network(Decomposed, (), 3, 1, exported=False).initial_carry() == ()
-
-
 def test_without_jax2onnx_a_network_is_refused_before_training(monkeypatch):
     monkeypatch.setitem(sys.modules, "jax2onnx", None)
     with pytest.raises(
@@ -232,12 +224,10 @@ def test_without_jax2onnx_a_network_is_refused_before_training(monkeypatch):
     assert make_network("gru", (8,), 3, 2).widths == (8, 2), "networks of this package need none"
 
 
-def test_a_network_without_flax_needs_three_functions():
-    importorskip()
-    assert export_graph(drawn(Wrong)) is not None
-
-
-def test_a_network_is_found_in_the_current_directory(tmp_path, monkeypatch):
+def test_networks_without_flax_without_an_export_and_of_the_current_directory(tmp_path, monkeypatch):
+    assert make_network(Decomposed, (), 3, 1, exported=False).initial_carry() == (), "a value function is not exported"
     (tmp_path / "my_nets.py").write_text("from flax import linen\nActor = linen.Dense\n")
     monkeypatch.chdir(tmp_path)
     assert make_network("my_nets:Actor", (), 3, 2).init(np.random.default_rng(0), 3, 1.0)["kernel"].shape == (3, 2)
+    importorskip()
+    assert export_graph(drawn(Wrong)) is not None

@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from environments import Bandit, Constant
+from environments import Bandit, Coin, Constant
 
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.training.config import PPOConfig
 from sim2real.training.environment.protocol import check_environment
 from sim2real.training.ppo.trainer import train
-from sim2real.training.ppo.update import keys
+from sim2real.training.ppo.update import Normaliser, keys, normalise_parameters, update_normaliser
 
 SMALL = PPOConfig(
     num_envs=64, minibatches=4, rollout_steps=16, total_steps=40_000, hidden=(32,), evaluations=4, eval_steps=20,
@@ -30,30 +30,24 @@ def bandit():
 
 
 def test_bandit_finds_the_best_action(bandit):
-    result, _, _ = bandit
+    result, reports, config = bandit
     observations = jax.random.uniform(jax.random.key(5), (200, 2), minval=-1.0)
     found = jax.vmap(result.best.get_action)(observations)
     wanted = jax.vmap(Bandit().best)(observations)
     assert result.history["success"][-1].min() > 0.95
     assert (np.abs(found - wanted) < np.array([[0.3, 0.75]])).mean() > 0.95
-
-
-def test_progress_comes_after_every_evaluation(bandit):
-    result, reports, config = bandit
+    # Progress comes after every evaluation.
     assert [report.evaluation for report in reports] == [1, 2, 3, 4]
     assert [report.env_steps for report in reports] == result.env_steps.tolist()
     assert result.env_steps[-1] >= config.total_steps
     assert (np.diff(result.elapsed_s) > 0).all()
     for name in ("return", "success", "finished", "policy_loss", "value_loss", "entropy", "kl", "reward"):
         assert result.history[name].shape == (4, 2)
-    assert result.history["return"][-1].mean() > result.history["return"][0].mean()
-
-
-def test_the_best_policy_is_one_that_was_evaluated(bandit):
-    result, _, _ = bandit
+    # The best policy is one that was evaluated.
     assert result.best.log_std.shape == (2,)
     assert result.policies.log_std.shape == (2, 2)
     success, returns = result.history["success"], result.history["return"]
+    assert returns[-1].mean() > returns[0].mean()
     best = returns[:, result.best_seed][success[:, result.best_seed] == success.max()]
     assert best.max() == returns[success == success.max()].max()
 
@@ -100,27 +94,40 @@ def test_value_of_a_constant_reward(env, value):
     assert result.history["policy_steps"][-1, 0] == 8.0
 
 
+class Scalar(Coin):
+    def privileged(self, state):
+        return state["coin"]
+
+
+class Infinite(Coin):
+    def privileged(self, state):
+        return jnp.stack([state["coin"], jnp.inf])
+
+
 @pytest.mark.parametrize(
-    ("wrong", "message"),
+    ("env", "change", "message"),
     [
-        ("observation", r"entries \[0\] of the observation are not finite \(seed 0"),
-        pytest.param("reward", "the reward is not finite", marks=pytest.mark.night),
+        (Constant(nan_at=3, wrong="observation"), {}, r"entries \[0\] of the observation are not finite \(seed 0"),
+        pytest.param(Constant(nan_at=3, wrong="reward"), {}, "the reward is not finite", marks=pytest.mark.night),
+        pytest.param(
+            Infinite(), {"privileged": True}, r"entries \[1\] of the privileged observation", marks=pytest.mark.night
+        ),
+        pytest.param(
+            Constant(),
+            {"learning_rate": 1e38, "epochs": 4},
+            "training's .*loss.* is not finite",
+            marks=pytest.mark.night,
+        ),
+        (Constant(length=50), {}, "no evaluation episode ended within eval_steps=20 rows"),
+        (Constant(), {"target": 0.5}, r"target=0.5 is a share of success.*\['policy_steps'\]"),
+        (Constant(), {"privileged": True}, "a Constant has no privileged entries"),
+        (Scalar(), {"privileged": True}, r"must return a vector, it has shape \(\)"),
     ],
 )
-def test_what_is_no_number_is_named(wrong, message):
-    with pytest.raises(Sim2RealError, match=rf"{message}[\s\S]*hint: "):
-        train(Constant(nan_at=3, wrong=wrong), TINY, jax.random.key(0))
-
-
-@pytest.mark.night  # the gate has an observation that is none
-def test_a_loss_that_is_no_number_is_named():
-    with pytest.raises(Sim2RealError, match=r"the training's .*loss.* is not finite[\s\S]*hint: lower learning_rate"):
-        train(Constant(), dataclasses.replace(TINY, learning_rate=1e38, epochs=4), jax.random.key(0))
-
-
-def test_episodes_longer_than_an_evaluation_are_an_error():
-    with pytest.raises(UsageError, match=r"no evaluation episode ended within eval_steps=20 rows[\s\S]*hint: raise"):
-        train(Constant(length=50), TINY, jax.random.key(0))
+def test_what_cannot_be_trained_is_named(env, change, message):
+    with pytest.raises(Sim2RealError, match=message) as error:
+        train(env, dataclasses.replace(TINY, **change), jax.random.key(0))
+    assert error.value.hint or isinstance(env, Scalar)
 
 
 class Broken(Constant):
@@ -184,12 +191,6 @@ def test_training_ends_where_the_best_seed_reaches_the_target(bandit):
 
 
 @pytest.mark.night
-def test_training_ends_at_the_first_evaluation_behind_its_time():
-    found = train(Bandit(), dataclasses.replace(SMALL, minutes=1e-6), jax.random.key(0))
-    assert len(found.env_steps) == 1
-
-
-@pytest.mark.night
 def test_evaluations_of_few_copies_judge_the_same_policies(bandit):
     full, _, config = bandit
     found = train(Bandit(), dataclasses.replace(config, eval_envs=16), jax.random.key(0))
@@ -201,7 +202,7 @@ def test_evaluations_of_few_copies_judge_the_same_policies(bandit):
 
 
 @pytest.mark.night
-def test_a_caller_that_ends_the_training_keeps_the_best_policy():
+def test_a_caller_or_a_time_limit_ends_the_training():
     kept = []
 
     def stop(progress):
@@ -210,9 +211,25 @@ def test_a_caller_that_ends_the_training_keeps_the_best_policy():
 
     with pytest.raises(KeyboardInterrupt):
         train(Bandit(), SMALL, jax.random.key(0), stop)
+    assert len(train(Bandit(), dataclasses.replace(SMALL, minutes=1e-6), jax.random.key(0)).env_steps) == 1
     assert kept[0].get_action(jnp.zeros(2)).shape == (2,)
 
 
-def test_a_target_without_a_success_is_refused():
-    with pytest.raises(UsageError, match=r"target=0.5 is a share of success.*\['policy_steps'\]"):
-        train(Constant(), dataclasses.replace(TINY, target=0.5), jax.random.key(0))
+@pytest.mark.night
+def test_a_privileged_value_function_knows_what_the_policy_cannot_see():
+    config = dataclasses.replace(SMALL, num_envs=64, total_steps=16_000, hidden=(16,), evaluations=1, gae_lambda=0.5)
+    blind, seeing = (
+        train(Coin(), dataclasses.replace(config, privileged=privileged), jax.random.key(0))
+        for privileged in (False, True)
+    )
+    assert seeing.history["value_loss"][-1, 0] < 0.6 * blind.history["value_loss"][-1, 0]
+    assert seeing.best.params[0][0].shape == blind.best.params[0][0].shape == (1, 16)
+
+
+def test_parameters_of_any_size_are_told_apart():
+    seen = np.array([[[1e-4, 5.0, 40.0], [1.02e-4, 5.0, 60.0]]], np.float32)
+    blank = Normaliser(jnp.float32(0), jnp.zeros(3), jnp.ones(3))
+    found = update_normaliser(blank, jnp.asarray(seen), jnp.ones((1, 2), bool))
+    own = np.stack([normalise_parameters(found, x) for x in seen[0]])
+    np.testing.assert_allclose(own[:, [0, 2]], [[-1, -1], [1, 1]], rtol=0.02)
+    np.testing.assert_allclose(own[:, 1], 0.0, atol=0.01)

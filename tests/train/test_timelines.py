@@ -33,8 +33,8 @@ def recorded(every, long_s, pauses=True):
 def loop():
     """A function that makes the loop with the computation times of a recording."""
 
-    def make(times):
-        bounds = delay_bounds({"sensor_delay": 0.02, "actuator_delay": 0.02}, 0.01, 0.002)
+    def make(times, sensor_s=0.02, actuator_s=0.02):
+        bounds = delay_bounds({"sensor_delay": sensor_s, "actuator_delay": actuator_s}, 0.01, 0.002)
         own = [BaseNode(n, RATE_HZ, delay=0.002, delay_dist=times.computation[n]) for n in NAMES]
         nodes = simulated_loop(*own, BaseWorld("world", 100.0), bounds)
         times.set_transport(nodes)
@@ -122,15 +122,11 @@ def test_longer_episodes_begin_like_shorter_ones():
     np.testing.assert_array_equal(stretches.begins(3, 9)[:, :4], stretches.begins(3, 4))
 
 
-def test_recordings_of_one_robot_have_rings_of_one_length():
+def test_recordings_of_one_robot_have_rings_of_one_length(loop):
     """Whether the least delay is nothing or 0.2 ms: a program that is to serve both has room for both."""
-    rings = []
+    rings, times = [], recorded(25, 0.004)
     for delay_s in (0.012, 0.0122):
-        times = recorded(25, 0.004)
-        bounds = delay_bounds({"sensor_delay": delay_s, "actuator_delay": 0.0104}, 0.01, 0.002)
-        own = [BaseNode(n, RATE_HZ, delay=0.002, delay_dist=times.computation[n]) for n in NAMES]
-        nodes = simulated_loop(*own, BaseWorld("world", 100.0), bounds)
-        times.set_transport(nodes)
+        nodes = loop(times, delay_s, 0.0104)
         timeline = draw_timelines(nodes, "agent", 1.0, 4, 3, times).timeline
         rings.append([wire(nodes, "agent", timeline, reusable=reusable).rings for reusable in (False, True)])
     (one, same), (other, again) = rings
