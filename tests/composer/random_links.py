@@ -27,7 +27,7 @@ def link(kit, seed, top, models, contacts, explicit, for_mjx):
         owner = [top, *models][draw.randint(1 + len(models))]
         by_text = owner is top and draw.rand() < 0.5
         if not (for_mjx and kind in NOT_ON_MJX):
-            _add(draw, kind, owner, models, f"x{number}", contacts, explicit, by_text)
+            add(draw, kind, owner, models, f"x{number}", contacts, explicit, by_text)
     for model in [top, *models]:
         model.resolve_references()  # what a program gave as text stays text in dm_control
     for model in models:
@@ -48,12 +48,12 @@ def _shift(elements):
         element.name = name
 
 
-def _add(draw, kind, owner, models, name, contacts, explicit, by_text):
+def add(draw, kind, owner, models, name, contacts, explicit, by_text):
     """Add an element of a kind to a model, if there is what it names."""
 
     def pick(what, accept=lambda element: True):
-        found = [e for m in models for e in m.find_all(what, exclude_attachments=True) if e.name and accept(e)]
-        found = [e for e in found if not e.name.endswith("/")]
+        found = [e for m in models for e in m.find_all(what, exclude_attachments=True)]
+        found = [e for e in found if getattr(e, "name", None) and e.name[-1] != "/" and accept(e)]
         element = found[draw.randint(len(found))] if found else None
         return element.full_identifier if element is not None and by_text else element
 

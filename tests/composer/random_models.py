@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import mujoco
 import numpy as np
+import random_links
 from mujoco.introspect.structs import STRUCTS
 
 KINDS = (
@@ -103,7 +104,7 @@ def make(kit, seed):
     for model in models:
         attached.append(_attach(draw, draw.pick(attached), model))
     for number in range(draw.randint(0, 4)):
-        _link(draw, draw.pick(attached), attached, f"x{number}")
+        random_links.add(draw, draw.pick(random_links.KINDS), top, attached, f"x{number}", True, True, draw.chance(0.3))
     for _ in range(draw.randint(0, 5)):
         if kit.name == "sim2real":  # what was written before a change is not what is written after it
             with contextlib.suppress(ValueError):
@@ -181,34 +182,6 @@ def _attach(draw, parent, model):
     if not frame.all_children() or frame.find_all("joint", immediate_children_only=True):
         frame.add("inertial", mass=1.0, pos=[0, 0, 0], diaginertia=[1, 1, 1])
     return model
-
-
-def _link(draw, owner, models, name):
-    """Add an element that names elements of any models to one that may be below them: the one at the top."""
-    owner = models[0]
-
-    def pick(kind, accept=lambda element: True):
-        found = [e for m in models for e in m.find_all(kind, exclude_attachments=True) if accept(e)]
-        return draw.pick(found) if found else None
-
-    kind = draw.pick(["weld", "joint", "motor", "frame", "spatial", "exclude", "pair"])
-    bodies = [pick("body", _has_name) for _ in range(2)]
-    joints = [pick("joint", lambda e: e.tag == "joint" and e.type in ("hinge", "slide")) for _ in range(2)]
-    sites, geoms = ([pick(what) for _ in range(2)] for what in ("site", "geom"))
-    if kind in ("weld", "exclude") and None not in bodies and bodies[0] is not bodies[1]:
-        (owner.equality if kind == "weld" else owner.contact).add(kind, name=name, body1=bodies[0], body2=bodies[1])
-    elif kind == "joint" and None not in joints and joints[0] is not joints[1]:
-        owner.equality.add("joint", name=name, joint1=joints[0], joint2=joints[1], polycoef=[0, 0.5, 0, 0, 0])
-    elif kind == "motor" and joints[0] is not None:
-        owner.actuator.add("motor", name=name, joint=joints[0], gear=[2.0])
-    elif kind == "frame" and None not in sites:
-        owner.sensor.add("framepos", name=name, objtype="site", objname=sites[0], reftype="site", refname=sites[1])
-    elif kind == "spatial" and None not in sites and sites[0] is not sites[1]:
-        tendon = owner.tendon.add("spatial", name=name)
-        for site in sites:
-            tendon.add("site", site=site)
-    elif kind == "pair" and geoms[0] is not geoms[1] and geoms[0].parent is not geoms[1].parent:
-        owner.contact.add("pair", name=name, geom1=geoms[0], geom2=geoms[1])
 
 
 def _change(draw, top, models):

@@ -33,6 +33,9 @@ def test_parts_of_several_elements_are_written_through(arm):
     sums[0] = 9
     assert physics.data.qpos[0] == 0
     assert not geoms.element_id.flags.writeable
+    joint = model.find("joint", "shoulder")  # the functional view is the same physics
+    assert physics.set(joint, "qpos", [0.2]).write(joint, "qvel", 2.0, 0) is physics
+    assert (physics.get(joint, "qpos"), physics.get(joint, "qvel")) == (0.2, 2.0)
 
 
 def test_what_cannot_be_bound_is_named(arm):
@@ -62,13 +65,6 @@ def test_named_arrays(arm):
     assert np.sum(data.qpos**2) == pytest.approx(0.04)
     with pytest.raises(KeyError, match=r"body 'hip' is not there. Available: world, upper, lower"):
         _ = data.xpos["hip"]
-
-
-def test_the_functional_view_is_the_same_physics(arm):
-    model, physics = arm
-    joint = model.find("joint", "shoulder")
-    assert physics.set(joint, "qpos", [0.3]).write(joint, "qvel", 2.0, 0) is physics
-    assert (physics.get(joint, "qpos"), physics.get(joint, "qvel")) == (0.3, 2.0)
 
 
 def test_names_and_numbers(arm):
@@ -102,34 +98,22 @@ def test_copies_and_states_are_independent(arm):
         physics.reset(1)
 
 
-FREE = '<mujoco><worldbody><body name="ball"><freejoint/><geom size=".1"/></body></worldbody></mujoco>'
-
-
-def test_gravity_is_compensated_where_no_body_was_when_the_model_was_compiled():
-    model = mjcf.from_xml_string(FREE)
+def test_gravity_is_compensated_and_constants_are_computed_anew_without_moving_the_state():
+    """Whether masses that were set by hand are seen must not depend on what is set after them."""
+    text = '<mujoco><worldbody><body name="ball"><freejoint/><geom size=".1"/></body></worldbody></mujoco>'
+    model = mjcf.from_xml_string(text)
     physics = mjcf.Physics.from_mjcf_model(model)
-    physics.bind(model.find("body", "ball")).gravcomp = 1.0
+    ball, before = physics.bind(model.find("body", "ball")), copy.copy(physics.model.ptr)
+    ball.gravcomp = 1.0  # no body was compensated when the model was compiled
     physics.forward()
     assert abs(physics.data.qacc[2]) < 1e-12
-
-
-def test_compensating_for_gravity_computes_no_other_constants():
-    """Whether masses that were set by hand are seen must not depend on what is set after them."""
-    model = mjcf.from_xml_string(FREE)
-    physics = mjcf.Physics.from_mjcf_model(model)
-    ball = physics.bind(model.find("body", "ball"))
-    before = copy.copy(physics.model.ptr)
     ball.mass = 100.0
     ball.gravcomp = 0.5
     assert physics.model.body_subtreemass[1] == before.body_subtreemass[1]
     assert physics.model.stat.meanmass == before.stat.meanmass
     assert (ball.mass, ball.gravcomp) == (100.0, 0.5)
-
-
-def test_constants_are_computed_anew_without_moving_the_state():
-    model = mjcf.from_xml_string(FREE)
-    physics = mjcf.Physics.from_mjcf_model(model)
     physics.data.qpos[2] = 0.5
     physics.forward()
     physics.recompute_constants()
+    assert physics.model.body_subtreemass[1] == 100.0
     assert physics.data.xpos[1, 2] == 0.5  # what the next step starts from

@@ -65,22 +65,8 @@ def test_task_then_entities_depth_first_then_extra_hooks(tree):
     assert with_action == {("before_step", "task"), ("before_step", "x"), ("before_substep", "task")}
 
 
-def test_hooks_that_do_nothing_are_left_out_and_new_entities_are_found():
-    calls = []
-
-    class Plain(composer.ModelWrapperEntity):
-        pass
-
-    root = Plain(mjcf.RootElement(model="root"))
-    env = composer.Environment(composer.NullTask(root))
-    env.reset()
-    root.attach(Noted("late", calls))
-    env.reset()
-    assert ("initialize_episode", "late", 2) in calls
-
-
-def test_an_entity_may_ask_for_the_action_too():
-    seen = []
+def test_new_entities_are_found_and_one_may_ask_for_the_action_too():
+    calls, seen = [], []
 
     class Watcher(composer.Entity):
         def _build(self):
@@ -89,7 +75,11 @@ def test_an_entity_may_ask_for_the_action_too():
         def before_step(self, physics, action, random_state):
             seen.append(list(action))
 
-    env = composer.Environment(composer.NullTask(Watcher()))
+    root = Watcher()
+    env = composer.Environment(composer.NullTask(root))
     env.reset()
     env.step([])
     assert seen == [[]]
+    root.attach(Noted("late", calls))
+    env.reset()
+    assert ("initialize_episode", "late", 2) in calls

@@ -14,6 +14,7 @@ from sim2real import composer
 from sim2real.composer import mjcf
 from sim2real.composer.mjx_environment import is_unstable
 from sim2real.composer.physics.mjx import constants, stepping
+from sim2real.composer.physics.mjx.import_mjx import held_links
 
 ENGINE = stepping.JaxEngine()
 
@@ -77,24 +78,16 @@ def test_derived_constants_are_those_of_mj_set_const(double):
     for name, value in found.items():
         expected = getattr(varied, name)
         np.testing.assert_allclose(np.reshape(value, expected.shape), expected, rtol=1e-12, atol=1e-12, err_msg=name)
-
-
-@pytest.mark.night
-@pytest.mark.parametrize(
-    "text",
-    [
-        BODIES,
-        """<mujoco><worldbody><camera/><body><joint name="one"/><geom size=".1"/></body></worldbody>
-        <tendon><fixed><joint joint="one" coef="1"/></fixed></tendon></mujoco>""",
-        """<mujoco><worldbody><body><joint name="one"/><geom size=".1"/></body></worldbody>
-        <actuator><motor joint="one"/></actuator></mujoco>""",
-    ],
-    ids=["all", "no actuator", "no camera, no tendon"],
-)
-def test_which_constants_are_derived_is_known_before(text):
-    model = mujoco.MjModel.from_xml_string(text)
-    given = mjx.put_model(model)
-    assert constants.derived(model, given) == set(jax.eval_shape(lambda m: constants.derive(model, m), given))
+    # Which are derived is known before, with or without actuators, cameras and tendons.
+    body = '<mujoco><worldbody>{}<body><joint name="one"/><geom size=".1"/></body></worldbody>{}</mujoco>'
+    tendon = '<tendon><fixed><joint joint="one" coef="1"/></fixed></tendon>'
+    for text in (
+        BODIES, body.format("<camera/>", tendon), body.format("", '<actuator><motor joint="one"/></actuator>')
+    ):  # fmt: skip
+        model = mujoco.MjModel.from_xml_string(text)
+        given = mjx.put_model(model)
+        derived = jax.eval_shape(lambda m, model=model: constants.derive(model, m), given)
+        assert constants.derived(model, given) == set(derived)
 
 
 @pytest.mark.night
@@ -175,3 +168,18 @@ def test_an_episode_ends_though_a_hook_hides_that_it_diverged():
     env = composer.MjxEnvironment(task)
     play = jax.jit(lambda key, action: env.step(env.reset(key), action))
     assert play(jax.random.key(0), np.array([1e12])).done
+
+
+@pytest.mark.night
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="elsewhere XLA itself weighs what it computes again")
+def test_cost_grows_with_the_length_of_a_chain():
+    def flops(links):
+        body = '<body pos="0.1 0 0"><joint axis="0 1 0"/><geom size="0.02" pos="0.05 0 0"/>'
+        text = f"<mujoco><worldbody>{body * links}{'</body>' * links}</worldbody></mujoco>"
+        model = mujoco.MjModel.from_xml_string(text)
+        device, data = mjx.put_model(model), mjx.make_data(model)
+        run = jax.jit(jax.vmap(lambda q: mjx.kinematics(device, data.replace(qpos=q)).xpos))
+        with held_links():
+            return run.lower(jnp.zeros((8, links))).compile().cost_analysis()["flops"]
+
+    assert flops(6) < 3 * flops(3)  # 5 times where links are computed again for those beyond

@@ -16,7 +16,7 @@ from sim2real.graph import Base, BaseNode
 from sim2real.graph.schedule import draw
 from sim2real.runtime.compiled.graph import CompiledGraph
 
-pytestmark = pytest.mark.night  # compiles kernels; starting without them is tested in test_warp_start.py
+pytestmark = pytest.mark.night  # compiles kernels; starting without them is tested in test_mjx_refusals.py
 STEPS, SUBSTEPS = 50, 2
 MISSING = "Warp is not installed: the extra warp"
 
