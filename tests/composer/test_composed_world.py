@@ -111,24 +111,19 @@ def test_a_graph_plays_the_task_of_the_c_engine_at_given_parameters():
     assert np.abs(found["x"]).max() > 0.01
 
 
-def test_wrong_rates_and_parameters_are_refused():
+def test_parameters_bring_the_constants_that_follow_from_them_and_wrong_ones_are_refused():
     task = Push()
-    with pytest.raises(UsageError, match=r"a tick of 0.01 s is no control step of 0.02 s"):
-        composer.ComposedWorld("world", task, rate=100.0)
-    geoms = task.root_entity.mjcf_model.find_all("geom")
-    with pytest.raises(UsageError, match="cannot change 'geom_contype'"):
-        composer.ComposedWorld("world", task, parameters={"c": (geoms, "contype")})
-
-
-def test_parameters_bring_the_constants_that_follow_from_them():
-    task = Push()
-    cart = task.root_entity.mjcf_model.find("body", "cart")
-    world = composer.ComposedWorld("world", task, parameters={"mass": (cart, "mass")})
+    cart, geoms = (task.root_entity.mjcf_model.find_all(kind) for kind in ("body", "geom"))
+    world = composer.ComposedWorld("world", task, parameters={"mass": (cart[0], "mass")})
     params = world.init_params().replace(values={"mass": jnp.array(2.0)})
     model = jax.jit(lambda params: world._model(params, starts=True))(params)
     np.testing.assert_allclose(model.body_invweight0[1], [0.5, 0.0], rtol=1e-6)
     state = jax.eval_shape(lambda: world.init_state(None, GraphState(params={"world": params})))
     assert {"body_invweight0", "body_subtreemass", "dof_invweight0"} <= set(state.leaves)  # steps go on with them
+    with pytest.raises(UsageError, match=r"a tick of 0.01 s is no control step of 0.02 s"):
+        composer.ComposedWorld("world", task, rate=100.0)
+    with pytest.raises(UsageError, match="cannot change 'geom_contype'"):
+        composer.ComposedWorld("world", task, parameters={"c": (geoms, "contype")})
 
 
 class Witness(Push):
@@ -173,19 +168,10 @@ def test_a_world_starts_where_its_parameters_say(witness):
     assert started(qpos=jnp.array([0.25]), qvel=jnp.array([2.0])) == [0.25, 2.0]
 
 
-@pytest.fixture(scope="module")
-def environment():
-    return composer.MjxEnvironment(Push(start=0.1), time_limit=0.2)
-
-
-@pytest.fixture(scope="module")
-def vector(environment):
-    pytest.importorskip("gymnasium", reason="the vector environment: the extra interop")
-    return composer.MjxVectorEnv(environment, 4)
-
-
 @pytest.mark.night
-def test_the_end_of_a_task_is_no_truncation_and_divergence_is_the_end(vector):
+def test_the_end_of_a_task_is_no_truncation_and_divergence_is_the_end():
+    pytest.importorskip("gymnasium", reason="the vector environment: the extra interop")
+    vector = composer.MjxVectorEnv(composer.MjxEnvironment(Push(start=0.1), time_limit=0.2), 4)
     vector.reset(seed=0)
     places = jnp.array([[1.0], [jnp.nan], [0.0], [0.0]])
     state = vector._last
@@ -198,11 +184,7 @@ def test_the_end_of_a_task_is_no_truncation_and_divergence_is_the_end(vector):
 
 
 @pytest.mark.parametrize(
-    ("name", "module", "needed"),
-    [
-        ("BraxEnv", "brax", "brax.envs.base"),
-        ("MjxVectorEnv", "vector", "gymnasium"),
-    ],
+    ("name", "module", "needed"), [("BraxEnv", "brax", "brax.envs.base"), ("MjxVectorEnv", "vector", "gymnasium")]
 )
 def test_without_the_other_library_the_error_names_the_extra(name, module, needed, monkeypatch):
     monkeypatch.delitem(vars(composer), name, raising=False)

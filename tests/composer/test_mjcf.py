@@ -7,7 +7,6 @@ import mujoco
 import numpy as np
 import pytest
 import random_models
-from mujoco import mjx
 from random_models import names
 
 from sim2real import composer
@@ -29,6 +28,12 @@ ROBOT = """
   <worldbody><body name="b"><joint name="j"/><geom name="g" size=".1" material="skin"/><site name="s"/></body>
     <body name="c" pos="0 0 1"><joint name="k"/><geom name="h" size=".1"/><site name="z"/></body>{inside}</worldbody>
   {beside}</mujoco>"""
+
+
+def robot(inside="", beside=""):
+    return mjcf.from_xml_string(ROBOT.format(inside=inside, beside=beside))
+
+
 NAMING = {
     "joint": ("joint k", '<equality><joint joint1="j" joint2="k"/></equality>'),
     "side site": (
@@ -46,24 +51,20 @@ def test_what_names_a_removed_element_stays_and_is_refused(reference, attached):
     """Without its second element, an equality would hold the first one in place."""
     removed, text = NAMING[reference]
     kind, name = removed.split()
-    parts = {"inside": text, "beside": ""} if kind in text[:8] or text.startswith("<camera") else {"beside": text}
-    robot = mjcf.from_xml_string(ROBOT.format(**({"inside": "", "beside": ""} | parts)))
+    model = robot(**{"inside" if text.startswith("<camera") else "beside": text})
     if attached:
-        mjcf.RootElement(model="w").attach(robot)
-    robot.find(kind, name).remove()
+        mjcf.RootElement(model="w").attach(model)
+    model.find(kind, name).remove()
     with pytest.raises(UsageError, match=f"names the {kind} '{name}', which was removed"):
-        robot.root_model.compile()
-
-
-def test_a_removed_material_is_forgotten():
-    robot = mjcf.from_xml_string(ROBOT.format(inside="", beside=""))
-    robot.find("material", "skin").remove()
-    assert robot.find("geom", "g").material is None
-    assert robot.compile().geom_matid.tolist() == [-1, -1]
+        model.root_model.compile()
+    plain = robot()
+    plain.find("material", "skin").remove()  # a material is forgotten
+    assert plain.find("geom", "g").material is None
+    assert plain.compile().geom_matid.tolist() == [-1, -1]
 
 
 def test_a_model_that_others_name_may_be_detached_and_come_back():
-    top, left, right = (mjcf.from_xml_string(ROBOT.format(inside="", beside="")) for _ in range(3))
+    top, left, right = (robot() for _ in range(3))
     top.model = "top"
     for model in (left, right):
         top.attach(model)
@@ -86,15 +87,12 @@ def test_text_names_what_is_there_when_the_world_is_compiled():
     top = mjcf.from_xml_string('<mujoco><actuator><motor name="m" joint="r/k"/></actuator></mujoco>')
     with pytest.raises(ValueError, match="r/k"):
         top.compile()
-    top.attach(mjcf.from_xml_string(ROBOT.format(inside="", beside="")))
+    top.attach(robot())
     model = top.compile()
     assert model.actuator("m").trnid[0] == model.joint("r/k").id
-
-
-def test_a_derived_attribute_is_refused_and_a_misspelt_one_names_those_that_exist():
-    site = mjcf.from_xml_string(ROBOT.format(inside="", beside="")).find("site", "s")
+    site = robot().find("site", "s")
     with pytest.raises(AttributeError, match="pos"):
-        site.xpos = [0, 0, 1]
+        site.xpos = [0, 0, 1]  # derived
     with pytest.raises(AttributeError, match="rgba"):
         _ = site.rgbaa
 
@@ -174,12 +172,12 @@ def test_a_task_knows_the_timestep_of_the_world(oracle, ours, when, physics, ste
 def keyed(attach_first, **values):
     world = mjcf.from_xml_string("""<mujoco model="w"><worldbody><body name="o" mocap="true"><geom size=".1"/></body>
       <body pos="0 0 3"><joint name="oj"/><geom size=".1"/></body></worldbody></mujoco>""")
-    robot = mjcf.from_xml_string(ROBOT.format(inside="", beside='<actuator><motor joint="k"/></actuator>'))
+    part = robot(beside='<actuator><motor joint="k"/></actuator>')
     if attach_first:
-        world.attach(robot)
+        world.attach(part)
     world.keyframe.add("key", name="home", **values)
     if not attach_first:
-        world.attach(robot)
+        world.attach(part)
     return mjcf.Physics.from_mjcf_model(world).model
 
 
@@ -197,12 +195,12 @@ def test_a_keyframe_of_the_whole_world_sets_all_models(attach_first):
 def test_numbers_of_a_keyframe_stay_with_elements_that_move(attached):
     rest = '<actuator><motor name="u" joint="j"/><motor name="v" joint="k"/></actuator>'
     rest += '<keyframe><key name="home" ctrl="1 2" qpos=".5 -.3"/></keyframe>'
-    robot = mjcf.from_xml_string(ROBOT.format(inside="", beside=rest))
-    robot.find("actuator", "u").remove()
-    robot.actuator.add("motor", name="u", joint="j")
+    part = robot(beside=rest)
+    part.find("actuator", "u").remove()
+    part.actuator.add("motor", name="u", joint="j")
     if attached:
-        composer.Arena().mjcf_model.attach(robot).add("joint", type="slide", name="rail")
-    model = robot.root_model.compile()
+        composer.Arena().mjcf_model.attach(part).add("joint", type="slide", name="rail")
+    model = part.root_model.compile()
     called = [model.actuator(i).name.removeprefix("r/") for i in range(2)]
     assert dict(zip(called, model.key_ctrl[0].tolist(), strict=True)) == {"u": 1.0, "v": 2.0}
     assert model.key_qpos[0].tolist() == [0.0] * attached + [0.5, -0.3]
@@ -223,27 +221,14 @@ def test_numbers_of_a_keyframe_stay_with_elements_that_move(attached):
     ],
 )  # fmt: skip
 def test_what_only_documents_can_hold_is_attached_with_them(text, count):
-    robot, top = ROBOT.format(inside="", beside=text), mjcf.RootElement(model="w")
+    top = mjcf.RootElement(model="w")
     for _ in range(2):
-        top.attach(mjcf.from_xml_string(robot))
-    assert mjcf.from_xml_string(robot).compile().nbody == 3 + count
+        top.attach(robot(beside=text))
+    assert robot(beside=text).compile().nbody == 3 + count
     model = top.compile()
     assert model.nbody == 1 + 2 * (3 + count)
     assert all(name.startswith(("r/", "r_1/")) for name in names(model)["body"][1:])
     assert model.nflex in (0, 2)
-
-
-def test_references_across_models_are_there_on_mjx():
-    top, left, right = (mjcf.from_xml_string(ROBOT.format(inside="", beside="")) for _ in range(3))
-    top.attach(left)
-    left.attach(right)
-    tendon = top.tendon.add("spatial", name="t")
-    for model in (left, right):
-        tendon.add("site", site=model.find("site", "s"))
-    top.actuator.add("motor", tendon=tendon)
-    left.equality.add("joint", joint1=right.find("joint", "j"), joint2=left.find("joint", "k"))
-    model = mjx.put_model(top.compile())
-    assert (model.ntendon, model.nu, model.neq, model.nv) == (1, 1, 1, 6)
 
 
 def test_a_model_with_a_free_joint_of_its_own_keeps_it():
