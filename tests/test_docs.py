@@ -210,11 +210,6 @@ def test_flags_in_backticks_exist():
     assert not re.search("--no-such-flag", all_flags())
 
 
-def test_tables_and_backticks_with_commands_that_do_not_exist_are_found():
-    page = "| command | does |\n|---|---|\n| `compare`, `sim2real info` | `x` |\n\n`train --sead 1`, `x`\n"
-    assert commands_of(page) == {"compare", "info", "train --sead 1"}
-
-
 def test_benches_of_pages_exist():
     benches = set(re.findall(r'^    "([a-z][\w-]*)": ', (ROOT / "scripts" / "bench.py").read_text(), re.MULTILINE))
     used = {name for page in PAGES for name in re.findall(r"scripts/bench\.py ([a-z][\w-]*)", page.read_text())}

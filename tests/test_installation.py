@@ -7,7 +7,6 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from installed import need
 
 from sim2real import installation
 from sim2real.errors import NotInstalled, UsageError
@@ -73,14 +72,3 @@ def test_no_page_and_no_hint_installs_a_package_of_this_name():
     assert found == []
     assert "rerun-sdk" in with_extra("view")
     assert with_extra("interop").count("'") == 4
-
-
-def test_a_program_that_continuous_integration_installs_is_no_skip_there(monkeypatch):
-    monkeypatch.delenv("CI", raising=False)
-    need("/usr/bin/chromium", "chromium")
-    with pytest.raises(pytest.skip.Exception, match="chromium"):
-        need(None, "chromium")
-    monkeypatch.setenv("CI", "true")
-    with pytest.raises(pytest.fail.Exception, match="chromium"):
-        need(None, "chromium")
-    assert "CI=true" in (ROOT / ".ci" / "run").read_text()

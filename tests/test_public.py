@@ -14,7 +14,8 @@ STAGES = ["check", "deploy", "export", "identify", "record", "report", "run", "t
 
 
 def test_importing_is_cheap_and_the_names_are_those_that_are_public():
-    code = "import sim2real, sys; from sim2real import composer; composer.Environment; print('jax' in sys.modules, *dir(sim2real))"
+    code = "import sim2real, sys; from sim2real import composer; composer.Environment; "
+    code += "print('jax' in sys.modules, *dir(sim2real))"
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     assert said[0] == "False"
     assert set(said[1:]) == {*sim2real.__all__, "interop", "__version__"}

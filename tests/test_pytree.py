@@ -55,7 +55,7 @@ TREES = [
 
 
 @pytest.mark.parametrize("tree", TREES)
-def test_leaves_are_those_of_jax_in_its_order(tree):
+def test_leaves_are_those_of_jax_in_its_order_and_make_the_tree_again(tree):
     ours, theirs = tree(plain), tree(struct)
     assert plain.leaves(ours) == jax.tree_util.tree_leaves(theirs)
     paths = [".".join(map(str, path)) for path, _ in plain.flatten_with_path(ours)[0]]
@@ -64,27 +64,18 @@ def test_leaves_are_those_of_jax_in_its_order(tree):
         for path, _ in jax.tree_util.tree_flatten_with_path(theirs)[0]
     ]
     assert paths == names
-
-
-@pytest.mark.parametrize("tree", TREES)
-def test_a_tree_is_built_from_its_leaves(tree):
-    whole = tree(plain)
-    values, structure = plain.flatten(whole)
-    assert plain.unflatten(structure, values) == whole
-    assert plain.structure(whole) == structure
-    doubled = plain.map(lambda a, b: a + b, whole, whole)
-    assert plain.leaves(doubled) == [2 * value for value in values]
-
-
-def test_trees_of_other_structure_are_refused():
-    with pytest.raises(ValueError, match="trees differ"):
-        plain.map(lambda a, b: a, {"a": 1}, {"b": 1})
+    values, structure = plain.flatten(ours)
+    assert plain.unflatten(structure, values) == ours
+    assert plain.structure(ours) == structure
+    assert plain.leaves(plain.map(lambda a, b: a + b, ours, ours)) == [2 * value for value in values]
 
 
 def test_constants_belong_to_the_structure():
     kind = message(plain)
     assert plain.structure(kind(1, 2, "n")) != plain.structure(kind(1, 2, "m"))
     assert plain.leaves(kind(1, 2).replace(first=5)) == [1, 5]
+    with pytest.raises(ValueError, match="trees differ"):
+        plain.map(lambda a, b: a, {"a": 1}, {"b": 1})
     with pytest.raises(dataclasses.FrozenInstanceError):
         kind(1, 2).first = 3
 

@@ -3,8 +3,6 @@
 import ast
 from pathlib import Path
 
-import jax
-
 ROOT = Path(__file__).parents[1]
 FILES = sorted(f for room in ("sim2real", "pipelines", "scripts") for f in (ROOT / room).rglob("*.py"))
 
@@ -26,11 +24,6 @@ def uses(function: ast.AST) -> dict[str, set[str]]:
 def functions(file: Path) -> list[ast.FunctionDef]:
     text = file.read_text()
     return [n for n in ast.walk(ast.parse(text)) if isinstance(n, ast.FunctionDef)] if "fold_in" in text else []
-
-
-def test_why_split_and_fold_must_not_meet():
-    key = jax.random.key(123)
-    assert (jax.random.key_data(jax.random.split(key, 3)[2]) == jax.random.key_data(jax.random.fold_in(key, 2))).all()
 
 
 def test_a_key_that_is_folded_has_no_other_use():

@@ -48,25 +48,15 @@ def outside(tmp_path):
 
 
 @pytest.mark.night
-def test_wheel_carries_the_pipelines_inside_the_package(wheel):
+def test_the_wheel_carries_the_pipelines_and_runs(wheel, environment, outside):
     names = zipfile.ZipFile(wheel).namelist()
-    assert "sim2real/_pipelines/pendulum/__init__.py" in names
-    assert {"sim2real/cli.py", "sim2real/SKILL.md"} <= set(names)
-    top = {name.split("/")[0] for name in names}
-    assert {name for name in top if not name.endswith(".dist-info")} == {"sim2real"}
-
-
-@pytest.mark.night
-def test_command_runs_from_the_wheel(environment, outside):
-    command = environment / "bin" / "sim2real"
+    assert {"sim2real/_pipelines/pendulum/__init__.py", "sim2real/cli.py", "sim2real/SKILL.md"} <= set(names)
+    assert {top for name in names if not (top := name.split("/")[0]).endswith(".dist-info")} == {"sim2real"}
+    command, python = environment / "bin" / "sim2real", environment / "bin" / "python"
     assert "exit codes" in call(command, "--help", **outside)
     assert "swing it up" in call(command, "info", **outside)
     assert "--duration-s" in call(command, "record", "pendulum", "--help", **outside)
-
-
-@pytest.mark.night
-def test_imports_come_from_the_wheel(environment, outside):
     code = "import sim2real, sim2real.stages.load as p; print(sim2real.__file__, p.load_robot('pendulum'))"
-    assert call(environment / "bin" / "python", "-c", code, **outside).startswith(str(environment))
+    assert call(python, "-c", code, **outside).startswith(str(environment))
     code = "from sim2real.stages.load import available; print(available()['pendulum'])"
-    assert "site-packages/sim2real/_pipelines/pendulum" in call(environment / "bin" / "python", "-c", code, **outside)
+    assert "site-packages/sim2real/_pipelines/pendulum" in call(python, "-c", code, **outside)
