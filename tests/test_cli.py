@@ -18,8 +18,9 @@ from sim2real.artifacts import run as run_folder
 from sim2real.artifacts.identification import Identification, Judgement
 from sim2real.commands import flags, run, stages
 from sim2real.commands.stages import module_of
+from sim2real.graph.episode import StepRecord
+from sim2real.log import McapRecorder
 from sim2real.runtime.failure import named
-from sim2real.stages.config import RecordConfig
 from sim2real.stages.load import defaults_of
 from sim2real.stages.validate.config import ValidateConfig
 
@@ -66,20 +67,6 @@ def fail_with(monkeypatch, error):
     monkeypatch.setitem(sys.modules, "sim2real.stages.session.record", module)
 
 
-def test_version(capsys):
-    assert cli.main(["--version"]) == 0
-    assert capsys.readouterr().out.startswith("sim2real ")
-
-
-@pytest.mark.parametrize("command", cli.COMMANDS)
-def test_every_command_has_help(capsys, command):
-    assert cli.main([command, "--help"]) == 0
-    out = capsys.readouterr().out
-    assert f"usage: sim2real {command}" in out
-    if command == "export":
-        assert [f for f in ("mjcf", "mjlab", "isaaclab", "json", "card", "policy") if f not in out] == []
-
-
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
@@ -97,6 +84,10 @@ def test_every_command_has_help(capsys, command):
         (["import", "--bogus"], "--runs\n\nhint: `sim2real import --help-all` lists all flags"),
         (["import", "run.csv", "--rate-hz", "0"], "above 0"),
         (["record", "pendulum", "--duration-s", "0"], "see `sim2real record --help`"),
+        (
+            ["record", "pendulum", "--amplitude", "5"],
+            "got 5.0\n\nhint: the limit stands in the robot's file: gate.limit",
+        ),
         (["report", "no_such"], "Pipelines: "),
         (["report", "runs/no_such"], "hint: check the path"),
         (["report", "--rerun", "pendulum"], "sim2real report pendulum --rerun"),
@@ -111,13 +102,6 @@ def test_wrong_commands_exit_2_and_name_what_there_is(capsys, calls, arguments, 
     assert "----" not in err, "the parser prints its reason in a box"
     assert not out
     assert not calls
-
-
-def test_the_configurations_own_error_keeps_its_hint(capsys):
-    assert cli.main(["record", "pendulum", "--amplitude", "5"]) == errors.USAGE
-    said = capsys.readouterr().err
-    assert said.startswith("error: the amplitude must lie in (0, 2.0], got 5.0\n\nhint: ")
-    assert "gate.limit" in said
 
 
 @pytest.mark.parametrize(
@@ -218,13 +202,17 @@ def test_flags_without_a_block_stand_before_all_blocks(capsys):
     assert "\n\n\n" not in shown
 
 
-def test_all_commands_together_show_forty_flags(capsys):
+def test_every_command_has_help_and_all_together_show_forty_flags(capsys):
     """A flag of a stage counts once, also where `run` has it with a prefix."""
     shown = set()
     for command in cli.COMMANDS:
         assert cli.main([command, "--help"]) == 0
-        names = re.findall(r"^  --([\w.-]+)", capsys.readouterr().out, re.MULTILINE)
+        out = capsys.readouterr().out
+        assert f"usage: sim2real {command}" in out
+        names = re.findall(r"^  --([\w.-]+)", out, re.MULTILINE)
         shown |= {name.rpartition(".")[2] for name in names}
+        if command == "export":
+            assert [f for f in ("mjcf", "mjlab", "isaaclab", "json", "card", "policy") if f not in out] == []
     assert len(shown) <= 40, sorted(shown)
 
 
@@ -244,29 +232,21 @@ def test_run_is_all_four_stages_in_one_folder_with_one_seed(calls, capsys):
     assert calls[0][1].duration_s == 5.0
     assert len({run_dir for *_, run_dir in calls[1:]}) == 1
     assert "record (1/4)" in capsys.readouterr().err
-
-
-def test_demo_is_a_run_of_the_embedded_pendulum(calls):
+    calls.clear()
     assert cli.main(["demo", "--seed", "4"]) == 0
     assert [config.seed for _, config, _ in calls] == [4] * 4
     assert {config.port for stage, config, _ in calls if stage in ("record", "deploy")} == {"embedded"}
 
 
-def test_resume_skips_what_is_finished(calls, capsys):
-    with run_folder.open_stage(Path("runs"), "pendulum", "record", RecordConfig()) as stage:
-        pass
-    assert cli.main(["run", "pendulum", "--resume", str(stage.run_dir)]) == 0
-    assert [name for name, *_ in calls] == ["identify", "train", "deploy"]
-    assert {run_dir for *_, run_dir in calls} == {stage.run_dir}
-    assert "record (1/4): finished before, skipped" in capsys.readouterr().err
-
-
-def test_resume_runs_everything_after_the_first_unfinished_stage(calls):
-    for name in ("record", "train"):
-        with run_folder.open_stage(Path("runs"), "pendulum", name, None, run_dir=Path("runs/pendulum/1")):
+@pytest.mark.parametrize("finished", [("record",), ("record", "train")])
+def test_resume_skips_what_is_finished_and_runs_everything_after_it(calls, capsys, finished):
+    for name in finished:
+        with run_folder.open_stage(Path("runs"), "pendulum", name, None, run_dir=Path("runs/pendulum/1")) as stage:
             pass
     assert cli.main(["run", "pendulum", "--resume", "1"]) == 0
     assert [name for name, *_ in calls] == ["identify", "train", "deploy"]
+    assert {run_dir for *_, run_dir in calls} == {stage.run_dir}
+    assert "record (1/4): finished before, skipped" in capsys.readouterr().err
 
 
 def test_report_finds_the_newest_run(monkeypatch, calls, capsys, tmp_path):
@@ -300,39 +280,24 @@ def test_info_of_installation_pipeline_and_run(calls, capsys, tmp_path):
 
 
 @pytest.mark.parametrize("cut", [0, 60])
-def test_info_of_a_log_whole_or_cut(capsys, tmp_path, cut):
-    from sim2real.graph.episode import StepRecord
-    from sim2real.log import McapRecorder
-
-    path = tmp_path / "session.mcap"
-    log = McapRecorder(path, {"pipeline": "pendulum"}, {"parameters.json": b"{}"}, {"sensor": {"th": 0.0}}, [])
+def test_info_of_a_log_whole_or_cut_and_names_that_do_not_control_the_terminal(capsys, tmp_path, cut):
+    path, evil = tmp_path / "session.mcap", "sensor\x1b[2J"
+    outputs = {node: {"th": 0.0} for node in ("sensor", evil)}
+    log = McapRecorder(path, {"pipeline": "pendulum"}, {"parameters.json": b"{}"}, outputs, [])
     log.start(time.time_ns(), time.monotonic_ns())
     for k in range(4):
-        slot = 20_000 * k
-        log.step(StepRecord("sensor", k, slot, slot, slot, -1, slot + 1000, 0), {"th": 0.1 * k})
+        for node in outputs:
+            slot = 20_000 * k
+            log.step(StepRecord(node, k, slot, slot, slot, -1, slot + 1000, 0), {"th": 0.1 * k})
     log.close()
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) - cut])
     assert cli.main(["info", str(path)]) == 0
-    out = capsys.readouterr().out
-    assert "/sensor/output         4" in out
-    assert "pipeline  pendulum" in out
-    assert "attachments  parameters.json 2 B" in out
-
-
-def test_names_in_a_log_do_not_control_the_terminal(capsys, tmp_path):
-    from sim2real.graph.episode import StepRecord
-    from sim2real.log import McapRecorder
-
-    path = tmp_path / "session.mcap"
-    log = McapRecorder(path, {"pipeline": "pendulum"}, {}, {"sensor\x1b[2J": {"th": 0.0}}, [])
-    log.start(time.time_ns(), time.monotonic_ns())
-    for k in range(4):
-        log.step(StepRecord("sensor\x1b[2J", k, k, k, k, -1, k + 1, 0), {"th": 0.1 * k})
-    log.close()
-    assert cli.main(["info", str(path)]) == 0
     assert cli.main(["info", "\x1b]0;mine\x07"]) == errors.USAGE
     out, err = capsys.readouterr()
+    assert re.search("^ *.?/sensor/output +4", out, re.MULTILINE)
+    assert "pipeline  pendulum" in out
+    assert "attachments  parameters.json 2 B" in out
     assert "\x1b" not in out + err
 
 
@@ -407,9 +372,10 @@ def test_public_names_are_listed_where_they_come_from():
         _ = sim2real.Nothing
 
 
-def test_signal_handlers_are_given_back():
+def test_the_version_is_printed_and_signal_handlers_are_given_back(capsys):
     before = signal.getsignal(signal.SIGTERM)
     assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("sim2real ")
     assert signal.getsignal(signal.SIGTERM) is before
 
 

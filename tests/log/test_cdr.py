@@ -78,16 +78,6 @@ def test_joint_states_read_alike_in_both(joints):
         np.testing.assert_array_equal(decoded.effort, efforts if joints else [])
 
 
-def test_many_messages_decode_at_once():
-    layout = Layout(
-        [CdrField("flag", np.dtype(bool)), CdrField("q", np.dtype("f8"), (3,)), CdrField("n", np.dtype("i2"))]
-    )
-    rows = np.frombuffer(b"".join(layout.pack([i % 2, np.full(3, i), i]) for i in range(50)), layout.dtype)
-    np.testing.assert_array_equal(rows["q"], np.arange(50.0)[:, None] * np.ones(3))
-    np.testing.assert_array_equal(rows["n"], np.arange(50))
-    np.testing.assert_array_equal(rows["flag"], np.arange(50) % 2 == 1)
-
-
 @pytest.mark.parametrize(
     ("value", "message"),
     [

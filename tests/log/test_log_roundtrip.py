@@ -126,6 +126,10 @@ def test_misuse_is_an_error(tmp_path):
         McapRecorder(tmp_path / "y.mcap", {"x": object()}, {}, {}, [])
     with pytest.raises(Sim2RealError, match="cannot be created"):
         McapRecorder(tmp_path / "no" / "y.mcap", {}, {}, {}, [])
+    log = McapRecorder(tmp_path / "z.mcap", {}, {}, {"a": {"x": 0.0}}, [])
+    log.step(StepRecord("a", 0, 0, 0, 0, -1, 1, 0), {"x": 1.0})
+    with pytest.raises(Sim2RealError, match="call start"):
+        log.close()
 
 
 @pytest.mark.parametrize(
@@ -146,10 +150,3 @@ def test_what_goes_wrong_in_the_writer_reaches_the_caller(tmp_path, record, outp
         log.close()
     with pytest.warns(TruncatedLogWarning, match="no end"):
         assert not read_log(tmp_path / "x.mcap").complete
-
-
-def test_data_before_the_start_is_an_error(tmp_path):
-    log = McapRecorder(tmp_path / "x.mcap", {}, {}, {"a": {"x": 0.0}}, [])
-    log.step(StepRecord("a", 0, 0, 0, 0, -1, 1, 0), {"x": 1.0})
-    with pytest.raises(Sim2RealError, match="call start"):
-        log.close()
