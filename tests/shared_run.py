@@ -30,15 +30,11 @@ from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.recording import LOG, TRUTH, Recording
 from sim2real.artifacts.run import finished, open_stage
 from sim2real.emulation.truth import Kind, TruthLog
-from sim2real.graph.episode import MessageRecord, StepRecord
-from sim2real.log.writer import McapRecorder
 from sim2real.stages.deploy import episodes
 from sim2real.stages.load import load_robot
 
 RECORD_S, VOLTS = 12.0, 2.0
 ROBOT = replace(hidden.Hidden.draw(1), jitter=0.0, lost=0.0, play=0.0)
-NODES = {"sensor": None, "agent": "sensor", "actuator": "agent"}
-EPOCH_NS = 1_790_000_000_000_000_000
 SUMMARY = {
     "transactions": 1200, "lost_replies": 0, "late_replies": 0,
     "command_timeouts": 0, "monotonic_ns": 0,
@@ -81,48 +77,23 @@ def recorded(log: Path, seed: int) -> Path:
 
 def write(log: Path, truth: Path, played: hidden.Played) -> dict[str, Any]:
     """Write a session's log and the account of its true motion; return the summary that ends the log."""
-    outputs = {
-        "sensor": [{"th": np.float32(th), "thdot": np.float32(thdot)} for th, thdot in played.measured],
-        "agent": [{"action": np.array([volts], np.float32)} for volts in played.volts],
-    }
-    outputs["actuator"] = outputs["agent"]
-    graph = {
-        n: {"rate_hz": hidden.RATE_HZ, "delay_s": 0.002, "inputs": {s: {"from": s, "blocking": True}} if s else {}}
-        for n, s in NODES.items()
-    }
-    metadata = {"pipeline": "pendulum", "graph": graph, "units": {"th": "rad", "thdot": "rad/s", "action": "V"}}
-    inputs = [(n, s) for n, s in NODES.items() if s]
-    recorder = McapRecorder(log, metadata, {}, {n: rows[0] for n, rows in outputs.items()}, inputs, {})
-    recorder.start(EPOCH_NS, 0)
-    starts, ends = ({n: np.round(1e6 * t).astype(int) for n, t in of.items()} for of in (played.starts, played.ends))
-    for k in range(len(played.volts)):
-        for node, sender in NODES.items():
-            start = int(starts[node][k])
-            recorder.step(StepRecord(node, k, start, start, start, -1, int(ends[node][k]), 0), outputs[node][k])
-            if sender:
-                recorder.message(MessageRecord(node, sender, k, k, start, start))
-    timing = {n: {"steps": len(played.volts), "overruns": 0} for n in NODES}
+    timing = {n: {"steps": len(played.volts), "overruns": 0} for n in ("sensor", "agent", "actuator")}
     summary = {**SUMMARY, "timing": timing}
-    recorder.close("finished", 0, summary)
-    write_truth(truth, played, 1000 * starts["sensor"], 1000 * starts["actuator"], 1000 * ends["actuator"])
-    return summary
-
-
-def write_truth(
-    path: Path, played: hidden.Played, read_ns: np.ndarray, begin_ns: np.ndarray, end_ns: np.ndarray
-) -> None:
-    """Write true parameters, states, and when samples were taken and commands took effect."""
+    hidden.write(log, played, summary)
+    # Write true parameters, states, and when samples were taken and commands took effect.
     values = {name: getattr(ROBOT, name) for name in ("gain", "gravity", "damping", "friction")}
-    account = TruthLog(path, {"state_names": ["th", "thdot"], "truth": values, "servo_ids": [1]})
+    account = TruthLog(truth, {"state_names": ["th", "thdot"], "truth": values, "servo_ids": [1]})
     for i in range(0, len(played.t), round(0.005 / hidden.STEP_S)):  # 200 Hz, as an emulated robot does
         state = float(played.angle[i]), float(played.speed[i])
         account.write(Kind.STATE, 0, 0, round(1e9 * played.t[i]), 0, 0, state)
     sensing_ns, acting_ns = round(1e9 * ROBOT.sensing), round(1e9 * ROBOT.acting)
-    for k, volts in enumerate(played.volts):
-        read, end = int(read_ns[k]), int(end_ns[k])
+    at_ns = lambda of, node: (1000 * np.round(1e6 * of[node]).astype(int)).tolist()  # noqa: E731
+    sampled, acted = at_ns(played.starts, "sensor"), (at_ns(of, "actuator") for of in (played.starts, played.ends))
+    for read, begin, end, volts in zip(sampled, *acted, played.volts, strict=True):
         account.write(Kind.SAMPLE, 1, read, read - sensing_ns, read, 0, (0.0, 0.0, 0.0))
-        account.write(Kind.EFFECT, 1, int(begin_ns[k]), end + acting_ns, 0, 0, (16.0, float(volts)))
+        account.write(Kind.EFFECT, 1, begin, end + acting_ns, 0, 0, (16.0, float(volts)))
     account.close()
+    return summary
 
 
 def shared(base: Path) -> Path:

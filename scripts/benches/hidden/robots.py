@@ -219,12 +219,12 @@ def probed(volts: float = 1.5, steps: int = 8) -> Controller:
     return act
 
 
-def write(path: Path, session: Played) -> None:
+def write(path: Path, session: Played, summary: Mapping[str, Any] | None = None) -> None:
     """Write a session's log."""
     readings = [{"th": np.float32(th), "thdot": np.float32(thdot)} for th, thdot in session.measured]
     commands = [{"action": np.array([volts], np.float32)} for volts in session.volts]
     units = {"th": "rad", "thdot": "rad/s", "action": "V"}
-    write_log(path, "pendulum", (session.starts, session.ends), readings, commands, units)
+    write_log(path, "pendulum", (session.starts, session.ends), readings, commands, units, summary)
 
 
 def write_log(
@@ -234,6 +234,7 @@ def write_log(
     readings: Sequence[Any],
     commands: Sequence[Any],
     units: Mapping[str, str],
+    summary: Mapping[str, Any] | None = None,
 ) -> None:
     """Write the log of a loop of sensor, agent and actuator.
 
@@ -241,6 +242,7 @@ def write_log(
         times: Node -> starts, and ends, of its steps ``(N,)`` [s].
         readings: The sensor's output of each step: a message, or a mapping of fields.
         commands: The output of agent and actuator of each step, likewise.
+        summary: What the session says at its end.
     """
     nodes = {"sensor": None, "agent": "sensor", "actuator": "agent"}
     graph = {
@@ -258,4 +260,4 @@ def write_log(
             recorder.step(StepRecord(node, k, start, start, start, -1, end, 0), sensed if node == "sensor" else sent)
             if sender:
                 recorder.message(MessageRecord(node, sender, k, k, start, start))
-    recorder.close("finished", 0, {})
+    recorder.close("finished", 0, dict(summary or {}))
