@@ -130,6 +130,26 @@ def test_samples_that_cannot_be_used_are_left_out_and_counted(tmp_path, reason, 
     assert facts(episode)["left out"] == {f"sensor, {reason}": len(kept)}
 
 
+def test_positions_alone_leap_whatever_the_unit_of_the_stamps(tmp_path):
+    q, goal = Q.copy(), Q.copy()
+    q[30], goal[20] = 90.0, 90.0
+    file = foreign_files.npz(tmp_path / "run.npz", t=STAMPS_US / 1e3, q=q, goal=goal)
+    fields = {"actuator": ("goal", "goal"), "sensor": ("position", "q")}
+    made = {
+        node: {"stamp_unit": "ms", "fields": {field: {"source": source, "unit": "rad"}}}
+        for node, (field, source) in fields.items()
+    }
+    episode = import_file(file, mapping(**made))
+    np.testing.assert_array_equal(episode.outputs["sensor"]["position"], np.delete(Q, 30, axis=0))
+    np.testing.assert_array_equal(episode.outputs["actuator"]["goal"], goal)
+
+
+def test_each_column_has_its_scale(file):
+    scaled = lambda scale: mapping(sensor={"fields": {"q": {"source": "q", "scale": scale}}})  # noqa: E731
+    np.testing.assert_allclose(import_file(file, scaled([2.0, -3.0])).outputs["sensor"]["q"], Q * [2.0, -3.0])
+    assert "3 values of scale" in refused(file, scaled([1.0, 2.0, 3.0]))
+
+
 def test_two_streams_that_share_a_table_lack_numbers_in_turn(tmp_path):
     odd = np.arange(COUNT) % 2 == 1
     file = foreign_files.npz(tmp_path / "run.npz", u=np.where(odd, U, np.nan), q=np.where(odd[:, None], np.nan, Q))
