@@ -1,4 +1,4 @@
-"""What the functions for Python take: objects, names, files; and the error for anything else."""
+"""What the functions for Python take: objects, names, files, logs in which units; and the error for anything else."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +13,7 @@ from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.episode import Episode, Steps
 from sim2real.stages.config import DeployConfig, IdentifyConfig, TrainConfig
 from sim2real.stages.shared import arguments
+from sim2real.stages.shared.arguments import open_recording, require_units
 
 FOUND = Identification(
     "pendulum",
@@ -77,3 +78,33 @@ def test_a_dict_of_what_is_different_is_a_configuration(pendulum):
     assert arguments.config_of(None, pendulum.defaults.train) is pendulum.defaults.train
     with pytest.raises(UsageError):
         arguments.config_of({"held_out": 2.0, "log": ()}, pendulum.defaults.identify)
+
+
+DATASET = Path(__file__).parents[2] / "datasets" / "pendulum" / "steps.mcap"
+
+
+def recording(units, metadata=None):
+    return Recording(Path("a.mcap"), Episode({}, {}, {}, metadata or {}, units=units))
+
+
+def test_units_come_from_the_channels_and_of_older_logs_from_the_session(pendulum):
+    assert recording({"sensor": {"th": "rad"}, "actuator": {"action": "V"}}).units == {"th": "rad", "action": "V"}
+    assert recording({"a": {"x": "m", "y": "s"}, "b": {"x": "mm"}}).units == {"y": "s"}
+    assert recording({}, {"units": {"th": "rad"}}).units == {"th": "rad"}
+    old = open_recording(DATASET, pendulum)  # of a session before anything had units
+    assert not old.units
+    assert np.isfinite(old.episode.outputs["sensor"]["th"]).all()
+
+
+@pytest.mark.parametrize(
+    ("units", "metadata", "said"),
+    [
+        ({"sensor": {"th": "deg"}}, {}, "'th' of 'sensor' is in deg in the log a.mcap, the robot computes in rad"),
+        ({"actuator": {"action": "mV"}}, {}, "'action' of 'actuator' is in mV"),
+        ({}, {"units": {"th": "deg"}}, "'th' of 'sensor' is in deg"),
+    ],
+)
+def test_a_log_in_other_units_is_refused(pendulum, units, metadata, said):
+    with pytest.raises(Sim2RealError, match=f"{said}(.|\n)*scale"):
+        require_units(recording(units, metadata), pendulum)
+    require_units(recording({"sensor": {"th": "rad", "temperature": "K"}, "camera": {"th": "px"}}), pendulum)

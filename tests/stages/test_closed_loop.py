@@ -2,7 +2,7 @@
 
 Stages and verdicts are real; the robot is a hidden pendulum on a simulated clock, so that no busy machine disturbs it.
 Its first recording, identification and training are those of the run that all tests share. In `make test`,
-test_killed.py runs the same plans with stages that only write files, and tests/stages judge and plan on their results.
+test_loop.py runs the same plans with stages that only write files.
 """
 
 import importlib
