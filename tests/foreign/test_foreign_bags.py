@@ -126,6 +126,16 @@ def in_json(path, encoding="json", data=lambda k: json.dumps({"q_rad": Q[k].toli
     return path
 
 
+def test_messages_that_mcap_cat_has_written(tmp_path):
+    """This is what the refusal of a bag in protobuf advises."""
+    lines = [
+        json.dumps({"topic": topic, "sequence": k, "log_time": log_ns / 1e9, "publish_time": 0.0, "data": message})
+        for k, (topic, _, message, log_ns) in enumerate(bags.rows())
+    ]
+    (tmp_path / "run.json").write_text("\n".join(lines))
+    is_right(imported(tmp_path / "run.json")[0])
+
+
 def test_messages_in_json(tmp_path):
     (table,) = open_tables(in_json(tmp_path / "x.mcap"))
     np.testing.assert_allclose(table.signal("/state.q_rad"), Q)

@@ -96,6 +96,9 @@ def test_a_vendors_names_are_matched_by_leg_and_number(tmp_path):
         (("front_left_knee", "front_left_hip"), ("FL_hip_joint", "FL_calf_joint"), [1, 0]),
         (("b", "a"), ("a_joint", "b_joint"), [1, 0]),
         (("hip_FR", "hip_FL", "calf_FR", "calf_FL"), ("FL_hip", "FL_calf", "FR_hip", "FR_calf"), [1, 3, 0, 2]),
+        (("A3", "A1", "A2"), ("iiwa_joint_1", "iiwa_joint_2", "iiwa_joint_3"), [1, 2, 0]),
+        (("m0", "m1"), ("joint1", "joint2"), [0, 1]),
+        (("j2", "j3"), ("joint1", "joint2"), None),
         (("FR_0", "FL_0", "RR_0"), ("FL_hip", "FL_thigh", "FL_calf"), None),
         (("x", "y"), ("a", "b"), None),
         (("FR_0", "FR_2"), ("FR_hip", "FR_thigh"), None),
@@ -104,6 +107,34 @@ def test_a_vendors_names_are_matched_by_leg_and_number(tmp_path):
 def test_names_match_or_they_do_not(labels, joints, places):
     found = columns_of(joints, tuple(x.lower() for x in labels))
     assert (found and found[0]) == places
+
+
+def test_joints_that_the_file_only_counts_are_in_the_order_of_their_numbers(tmp_path):
+    np.savez(tmp_path / "run.npz", t_s=T, goal_rad=GOAL, q_rad=Q, names=np.array(["motor_2", "motor_1"]))
+    episode, found = imported(tmp_path / "run.npz", joints=("hip", "knee"))
+    np.testing.assert_array_equal(episode.outputs["sensor"]["position"], Q[:, ::-1])
+    np.testing.assert_array_equal(episode.outputs["actuator"]["goal"], GOAL[:, ::-1])
+    assert any("order is assumed" in line for line in found.evidence)
+
+
+def test_columns_with_units_of_their_own_are_one_field(tmp_path):
+    columns = {"t_s": T, "goal_a_mdeg": 1e3 * np.degrees(GOAL[:, 0]), "goal_b_rad": GOAL[:, 1]}
+    columns |= {"q_a_deg": np.degrees(Q[:, 0]), "q_b_rev": Q[:, 1] / (2 * np.pi)}
+    episode, _ = imported(csv(tmp_path / "run.csv", columns))
+    np.testing.assert_allclose(episode.outputs["sensor"]["position"], Q, atol=1e-4)
+    np.testing.assert_allclose(episode.outputs["actuator"]["goal"], GOAL, atol=1e-4)
+
+
+def test_a_gripper_of_lerobots_names_is_in_no_unit_of_angle(tmp_path):
+    columns = {"t_s": T} | {f"action.{j}.pos": GOAL[:, i] for i, j in enumerate(("elbow", "gripper"))}
+    columns |= {f"state.{j}.pos": Q[:, i] for i, j in enumerate(("elbow", "gripper"))}
+    with pytest.raises(UsageError, match="gripper as 0 to 100"):
+        proposed(csv(tmp_path / "run.csv", columns), unit="deg")
+
+
+def test_a_column_that_may_be_the_time_is_named_in_the_question(tmp_path):
+    found = proposed(table(tmp_path, stamps="Tijd"))
+    assert all('stamps = "Tijd"' in text for text in found.questions.values())
 
 
 def test_columns_of_a_floating_base_before_those_of_the_joints_are_asked(tmp_path):

@@ -45,6 +45,9 @@ def read(path, text):
             "t,q\n2024-05-01T00:00:01.25Z,1\n2024-05-01T02:00:01.5+02:00,2\n",
             {"t": [1714521601250000000, 1714521601500000000], "q": [1, 2]},
         ),
+        ("t,q,u\ns,deg,deg\n0,1,2\n1,2,3\n", {"t s": [0, 1], "q deg": [1, 2], "u deg": [2, 3]}),
+        ("t,q,u\n[s],[rad],[V]\n0,1,2\n1,2,3\n", {"t [s]": [0, 1], "u [V]": [2, 3]}),
+        (",goal,pos\nt,a,a\n0,1,2\n1,2,3\n", {"t": [0, 1], "goal a": [1, 2], "pos a": [2, 3]}),
         ("t,q\n1700000000000000001,1\n1700000000000000003,2\n", {"t": [1700000000000000001, 1700000000000000003]}),
     ],
 )
@@ -108,6 +111,11 @@ def test_the_content_decides_not_the_suffix(tmp_path, suffix):
         (gzip.compress(b"t,q\n0,1\n", mtime=0), "gunzip"),
         (b"\x89HDF\r\n\x1a\n" + bytes(99), "h5py"),
         (b"MATLAB 5.0 MAT-file" + bytes(99), "loadmat"),
+        (b"header:\n  stamp:\n    sec: 1\n", "rostopic echo -p"),
+        (b"version https://git-lfs.github.com/spec/v1\n", "git lfs pull"),
+        (b"<!DOCTYPE html><html>", "download the file itself"),
+        (pickle.dumps({"u": [1.0]}, 2), "np.savez"),
+        (bytes(257) + b"ustar" + bytes(250), "is binary"),
         (b"ULog\x01\x12\x35" + bytes(99), "ulog2csv"),
         (pickle.dumps({"u": [1.0]}), "np.savez"),
         (b"PK\x03\x04" + bytes(99), "complete"),
@@ -118,6 +126,14 @@ def test_the_content_decides_not_the_suffix(tmp_path, suffix):
 def test_a_container_that_is_not_read_is_named_with_the_command_that_converts_it(tmp_path, content, named, suffix):
     with pytest.raises(UsageError, match=rf"(?s){named}"):
         read(tmp_path / f"x{suffix}", content)
+
+
+@pytest.mark.parametrize(("entry", "named"), [("xl/workbook.xml", "Excel"), ("run.csv", "zip archive of run.csv")])
+def test_an_archive_without_arrays_is_named(tmp_path, entry, named):
+    with zipfile.ZipFile(tmp_path / "x.npz", "w") as file:
+        file.writestr(entry, "t,q\n")
+    with pytest.raises(UsageError, match=named):
+        open_tables(tmp_path / "x.npz")
 
 
 def test_arrays(tmp_path):

@@ -65,6 +65,19 @@ def read_bag(path: Path) -> Table:
     return table
 
 
+def read_messages(path: Path, rows: Sequence[Mapping[str, Any]]) -> Table:
+    """Read the messages that ``mcap cat --json`` writes, with ``log_time`` in seconds; see ``read_bag``."""
+    topics: dict[str, _Topic] = {}
+    for row in rows:
+        topic = topics.setdefault(row["topic"], _Topic(row["topic"], None, "json", path))
+        seconds = float(row["log_time"])
+        topic.take(json.dumps(row["data"]).encode(), round(seconds * (1e9 if seconds < 1e11 else 1.0)))
+    table = Table(path, "mcap")
+    for topic in topics.values():
+        topic.add_to(table)
+    return table
+
+
 def _files(path: Path) -> list[Path]:
     if path.is_file():
         return [path]
@@ -168,7 +181,9 @@ class _Topic:
 
 def _names(row: Mapping[str, Any]) -> list[str]:
     """Return the names of the joints of a flattened message."""
-    return next((row[key] for key in ("name", "names", "joint_names") if isinstance(row.get(key), list)), [])
+    return next(
+        (row[key] for key in ("name", "names", "joint_names", "joints.name") if isinstance(row.get(key), list)), []
+    )
 
 
 def _add(table: Table, name: str, key: str, rows: Sequence[Mapping[str, Any]], names: list[str]) -> None:

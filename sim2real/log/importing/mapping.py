@@ -22,7 +22,15 @@ MAPPING = "import.toml"
 """The mapping file in a pipeline's folder."""
 Key = tuple[str, str, str]
 """Node, field or empty, and key of a line of a mapping file."""
-_SI = {"deg": (math.pi / 180, "rad"), "rev": (2 * math.pi, "rad"), "mrad": (1e-3, "rad"), "mm": (1e-3, "m")}
+_SI = {
+    "deg": (math.pi / 180, "rad"),
+    "rev": (2 * math.pi, "rad"),
+    "mrad": (1e-3, "rad"),
+    "mdeg": (math.pi / 180_000, "rad"),
+    "cdeg": (math.pi / 18_000, "rad"),
+    "mm": (1e-3, "m"),
+}
+LENGTHS_AND_ANGLES = ("rad", "m", *_SI)
 _OPEN_QUESTION = re.compile(r"^#\s*([a-z_]+) = .*\?", re.MULTILINE)
 _HINT = "the guide 'Import' has a mapping file with every key"
 

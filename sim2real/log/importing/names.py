@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sim2real.errors import UsageError
-from sim2real.log.importing.mapping import FieldMapping
+from sim2real.log.importing.mapping import LENGTHS_AND_ANGLES, FieldMapping, in_si
 from sim2real.types import Json
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ _SIDES = {
     ),
 }
 _QUANTITIES = {
-    "stamp": "t time times stamp stamps timestamp timestamps sec secs seconds date datetime elapsed clock uptime",
+    "stamp": "t time times zeit stamp stamps timestamp timestamps sec secs seconds date datetime elapsed clock uptime",
     "position": "q qs qj qpos pos jpos position positions ang angle angles th theta",
     "velocity": "dq qd qvel vel velocity velocities speed speeds omega thdot qdot",
     "torque": "tau torque torques effort efforts load loads current currents force forces",
@@ -40,7 +40,7 @@ _QUANTITIES = {
     "rate": "fps rate hz freq frequency",
     "period": "dt period",
     "error": "error errors err",
-    "counter": "seq sequence",
+    "counter": "seq sequence layout",
 }
 _UNITS = {
     "rad": "rad rads radian radians",
@@ -52,6 +52,8 @@ _UNITS = {
     "counts": "raw count counts tick ticks",
     "rev": "rev revs revolution revolutions turn turns rotations",
     "mrad": "mrad milliradians",
+    "mdeg": "mdeg millidegrees",
+    "cdeg": "cdeg centidegrees",
     "mm": "mm millimeters millimetres",
     "m": "m meters metres",
     "percent": "percent pct normalized normalised hundredths",
@@ -108,12 +110,18 @@ def meaning(name: str) -> Meaning:
         quantity, unit, rest = "stamp", _UNIT[words[0]], []
     # `dq_rad_s`: an angle over a time is a velocity, in the angle's unit.
     if quantity == "velocity" and unit == "s":
-        unit = next((u for w in words if (u := _UNIT.get(w, "")) in ("rad", "deg", "rev", "mrad", "m", "mm")), "")
+        unit = next((u for w in words if (u := _UNIT.get(w, "")) in LENGTHS_AND_ANGLES), "")
     side = _side(name)
     if "act" in rest and not side:  # the actual position, or an action
         side = "measured" if quantity else "command"
         rest.remove("act")
     return Meaning(side, quantity, unit, "_".join(rest))
+
+
+def is_unit(cell: str) -> bool:
+    """Return whether a cell of a table holds a unit, such as ``[rad]``, or nothing."""
+    others = {"v", "a", "n", "nm"}  # of quantities that are no angles
+    return bool(re.fullmatch(r"\[.*\]|\(.*\)", cell.strip())) or all(w in _UNIT or w in others for w in _words(cell))
 
 
 def _words(name: str) -> list[str]:
@@ -161,6 +169,14 @@ def are_numbers(labels: Sequence[str]) -> bool:
     return None not in found and len({match[1] for match in found if match}) == 1
 
 
+def numbers_of(names: Sequence[str]) -> list[int]:
+    """Return the numbers by which alone names differ, as ``A1`` and ``A2`` do; nothing if they differ otherwise."""
+    found = [re.fullmatch(r"(.*?)(\d+)", "_".join(w for w in _words(n) if w not in _FILLERS)) for n in names]
+    numbers = [int(match[2]) for match in found if match]
+    stems = {match[1] for match in found if match}
+    return numbers if len({*numbers}) == len(names) and len(stems) == 1 else []
+
+
 def same_joint(label: str, joint: str) -> bool:
     """Return whether a column's label is the name of a model's joint, as ``fl_hip`` is of ``FL_hip_joint``."""
     return bool(_spellings(label) & _spellings(joint))
@@ -174,12 +190,17 @@ def _spellings(joint: str) -> set[str]:
 def columns_of(joints: Sequence[str], labels: Sequence[str]) -> tuple[list[int], str] | None:
     """Return the column of each joint of a robot by the labels of columns, and how they match; None if they do not.
 
-    Names match as they are, or by leg and part: a vendor's ``FR_0`` is the first joint of the front right leg,
-    ``LF_HAA`` the hip of the front left one.
+    Names match as they are, by number, if only numbers tell them apart, or by leg and part: a vendor's ``FR_0`` is the
+    first joint of the front right leg, ``LF_HAA`` the hip of the front left one.
     """
     exact = [[i for i, label in enumerate(labels) if same_joint(label, joint)] for joint in joints]
     if all(len(found) == 1 for found in exact):
         return [found[0] for found in exact], "by name"
+    mine, given = numbers_of(joints), numbers_of(labels)
+    if mine and given:  # each may count from 0 or from 1
+        shifts = {0, min(mine) - min(given)} if {min(mine), min(given)} == {0, 1} else {0}
+        found = next((s for s in shifts if {k - s for k in mine} <= set(given)), None)
+        return None if found is None else ([given.index(k - found) for k in mine], "by number")
     own, theirs = _legs(joints), _legs(labels)
     if not own or not theirs or len(set(own)) < len(joints) or len(set(theirs)) < len(labels):
         return None
@@ -233,6 +254,7 @@ class Signal:
         labels: Joint of each column; empty if its name has none.
         values: Shape ``(N, columns)``; ``(columns,)`` for constants.
         whole: Source of all columns together; empty if they are separate signals of the file.
+        scale: What makes each column SI, if their names have several units; else empty.
         stream: The topic in a bag, or the file of one of several; empty for others.
     """
 
@@ -242,6 +264,7 @@ class Signal:
     values: np.ndarray
     whole: str = ""
     stream: str = ""
+    scale: tuple[float, ...] = ()
 
     @property
     def name(self) -> str:
@@ -255,11 +278,13 @@ class Signal:
         """Return some of the columns, in this order."""
         whole = self.whole if list(places) == list(range(self.width)) else ""
         sources, labels = (tuple(part[i] for i in places) for part in (self.sources, self.labels))
-        return replace(self, sources=sources, labels=labels, values=self.values[..., list(places)], whole=whole)
+        scale = tuple(self.scale[i] for i in places) if self.scale else ()
+        values = self.values[..., list(places)]
+        return replace(self, sources=sources, labels=labels, values=values, whole=whole, scale=scale)
 
     def mapped(self, unit: str) -> FieldMapping:
         """Return the field that has these columns."""
-        return FieldMapping(self.whole or self.sources, unit)
+        return FieldMapping(self.whole or self.sources, unit, **({"scale": self.scale} if self.scale else {}))
 
 
 def collect(table: Table) -> tuple[list[Signal], list[str]]:
@@ -297,8 +322,10 @@ def collect(table: Table) -> tuple[list[Signal], list[str]]:
             signals.append(Signal(tuple(f"{key}[:,{i}]" for i in range(n)), labels, named, values, key, stream))
         else:
             row = Signal((key,), (_label(key, named, table),), named, values[..., None], stream=stream)
-            alike.setdefault((replace(named, label=""), values.shape, stream), []).append(row)
-    for (named, _, stream), rows in alike.items():
+            alike.setdefault((replace(named, label="", unit=""), values.shape, stream), []).append(row)
+    for (named, stream), rows in [((m, s), r) for (m, _, s), all_rows in alike.items() for r in _by_unit(all_rows)]:
+        several = len({row.meaning.unit for row in rows}) > 1
+        named = replace(named, unit="rad" if several else rows[0].meaning.unit)
         labels = tuple(row.labels[0] for row in rows)
         numbered = are_numbers(labels)
         together = len(set(labels)) == len(labels) > 1 and "" not in labels and named.quantity != "stamp"
@@ -306,10 +333,21 @@ def collect(table: Table) -> tuple[list[Signal], list[str]]:
             signals += rows
             continue
         values = np.concatenate([row.values for row in rows], axis=-1)
-        found = Signal(tuple(r.sources[0] for r in rows), labels, named, values, stream=stream)
+        scale = tuple(in_si(row.meaning.unit)[0] for row in rows) if several else ()
+        found = Signal(tuple(r.sources[0] for r in rows), labels, named, values, stream=stream, scale=scale)
         numbers = [int(re.findall(r"\d+", label)[0]) for label in labels] if numbered else []
         signals.append(found.taken(np.argsort(numbers, kind="stable").tolist()) if numbered else found)
     return signals, notes
+
+
+def _by_unit(rows: list[Signal]) -> list[list[Signal]]:
+    """Return signals by their units; those of different joints, each with a unit of length or angle, stay together."""
+    groups: dict[str, list[Signal]] = {}
+    for row in rows:
+        groups.setdefault(row.meaning.unit, []).append(row)
+    labels = [row.labels[0] for row in rows]
+    together = set(groups) <= {*LENGTHS_AND_ANGLES} and len({*labels}) == len(labels) and "" not in labels
+    return [rows] if together and rows[0].meaning.quantity in ("", "position") else list(groups.values())
 
 
 def _meaning(key: str, table: Table) -> Meaning:

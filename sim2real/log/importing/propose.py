@@ -16,6 +16,7 @@ from sim2real.errors import UsageError
 from sim2real.log.importing import checks, lerobot
 from sim2real.log.importing.importer import import_table
 from sim2real.log.importing.mapping import (
+    LENGTHS_AND_ANGLES,
     STAMP_UNITS,
     FieldMapping,
     ImportMapping,
@@ -24,7 +25,16 @@ from sim2real.log.importing.mapping import (
     in_si,
     to_toml,
 )
-from sim2real.log.importing.names import Meaning, Signal, about_torque, are_numbers, collect, columns_of, meaning
+from sim2real.log.importing.names import (
+    Meaning,
+    Signal,
+    about_torque,
+    are_numbers,
+    collect,
+    columns_of,
+    meaning,
+    numbers_of,
+)
 from sim2real.log.importing.readers import Table
 
 _FIELDS = {
@@ -215,7 +225,10 @@ class Proposal:
                 unlike.append(s)
         if len(unlike) == 1:
             return unlike[0]
-        choices = unlike or [s for s in series if s.meaning.quantity in ("", "position")]
+        other_side = {"measured": "command", "command": "measured"}[side]
+        choices = unlike or [
+            s for s in series if s.meaning.quantity in ("", "position") and s.meaning.side != other_side
+        ]
         if other is not None:  # the likeliest first
             choices.sort(key=lambda s: (set(s.labels) != set(other.labels), s.width != other.width))
         if not choices and (longest := max((len(s.values) for s in self.signals), default=0)) < 3:
@@ -249,7 +262,8 @@ class Proposal:
                 pairs = ", ".join(f"{labels[i]} is {joint}" for joint, i in zip(joints, places, strict=True))
                 self.evidence.append(f"joints {found[1]}: {pairs}")
             return places, joints
-        named = any(labels) and not are_numbers(labels)
+        numbered = are_numbers(labels) and not numbers_of(joints)
+        named = any(labels) and not numbered
         if not named and measured.whole and measured.width == len(joints) + _FLOATING:
             source = f"{measured.whole}[:,{_FLOATING}:{measured.width}]"
             self.questions[at] = (
@@ -265,12 +279,16 @@ class Proposal:
                 hint="name the recorded joints as the file does, or list the sources in a mapping in the robot's order"
                 + "; --as-told takes the file's order for the robot's" * (len(joints) == measured.width),
             )
+        if numbered and (numbers := numbers_of(labels)):
+            measured = measured.taken(places := np.argsort(numbers).tolist())
+        else:
+            places = list(range(measured.width))
         self.reasons[at] = "no names of joints: the robot's order is assumed"
         self.evidence.append(
             f"columns have no names of joints, so the robot's order is assumed: {', '.join(joints)}; --joints sets "
             "another"
         )
-        return list(range(measured.width)), joints
+        return places, joints
 
     def matched(self, command: Signal, measured: Signal, places: Sequence[int]) -> tuple[Signal, bool]:
         """Return the commands in the order of the joints, and whether names match them."""
@@ -284,7 +302,7 @@ class Proposal:
                     self.evidence.append(f"commands belong to positions {found[1]}")
                 return command.taken(found[0]), True
         named = all(measured.labels) and all(command.labels)
-        if named and not (are_numbers(measured.labels) and are_numbers(command.labels)):
+        if named and not (are_numbers(measured.labels) or are_numbers(command.labels)):
             raise UsageError(
                 f"the commands {command.name!r} in {self.table.path} are of {', '.join(command.labels)}, the positions "
                 f"{measured.name!r} of {', '.join(measured.labels)}",
@@ -359,11 +377,16 @@ class Proposal:
                 k = back[0] + 1
                 raise UsageError(
                     f"the stamps {s.name!r} in {self.table.path} step back before sample {k}, from "
-                    f"{values[k - 1]:.15g} to {values[k]:.15g}: two recordings in one file, or a clock that was set",
+                    f"{values[k - 1]:.15g} to {values[k]:.15g}: two recordings in one file, a clock that was set, or a "
+                    "counter that began again",
                     hint=f"import a part: --samples 0:{k} or {k}:; --rate-hz spaces all samples evenly",
                 )
         if rate_hz is None:
-            why = f"the stamps {named[0].name!r} repeat or step back" if named else "the file has no time stamps"
+            why = f"the stamps {named[0].name!r} repeat or step back" if named else "no column is named as a time"
+            if dates := [k for k in self.table.words if meaning(k).quantity == "stamp"]:
+                why = f"the stamps {dates[0]!r} are words, such as {self.table.words[dates[0]][0]!r}: write ISO dates"
+            elif not named and (even := [s.name for s in self.signals if _may_be_stamps(s, count)]):
+                why += f', but {even[0]!r} increases: is it stamps = "{even[0]}"?'
             self.questions[node, "", "rate_hz"] = f"?  # samples per second: {why}; --rate-hz answers, too"
         self.reasons[node, "", "rate_hz"] = reason
         return {"rate_hz": rate_hz or 1.0}, np.arange(count) / (rate_hz or 1.0)
@@ -379,13 +402,15 @@ class Proposal:
         if self.hints.unit:
             if self.hints.unit == "hundredths" and calibration is None:
                 raise UsageError("hundredths of a joint's range need LeRobot's calibration", hint="--calibration FILE")
-            if self.table.robot and not calibration and (jaws := list(filter(lerobot.is_gripper, signal.labels))):
+            names = names or signal.sources
+            hers = self.table.robot or (self.hints.unit == "deg" and all(name.endswith(".pos") for name in names))
+            if hers and not calibration and (jaws := list(filter(lerobot.is_gripper, signal.labels))):
                 raise UsageError(
                     f"LeRobot writes {', '.join(jaws)} as 0 to 100 of its range, which is in no unit of angle",
                     hint="--calibration FILE.json converts it",
                 )
             return self.hints.unit, "--unit"
-        if named in ("rad", "deg", "rev", "mrad", "m", "mm"):
+        if named in LENGTHS_AND_ANGLES:
             return named, "by its name"
         if named in ("counts", "percent"):
             return "", '"counts:4096"?' if named == "counts" else '"rad" with a scale, as percent of which angle?'
@@ -595,6 +620,11 @@ def _period(values: np.ndarray) -> float:
 def _increases(values: np.ndarray) -> bool:
     steps = np.diff(values[np.isfinite(values)])
     return steps.size > 1 and float((steps > 0).mean()) > 0.9 and not (steps < 0).any()
+
+
+def _may_be_stamps(signal: Signal, count: int) -> bool:
+    nameless = not signal.meaning.quantity and not signal.meaning.side
+    return nameless and signal.values.shape == (count, 1) and _increases(signal.values[:, 0])
 
 
 def joint_motion(table: Table, joints: Sequence[str], unit: str) -> tuple[np.ndarray, np.ndarray, str]:

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from sim2real.errors import UsageError
+from sim2real.log.importing.names import is_unit
 from sim2real.types import Json
 
 _NULL = frozenset(("", "nan", "null", "none", "n/a", "na", "nil", "-", "--", "?"))
@@ -27,6 +28,11 @@ _COMMENT = re.compile(r"\s*(#|%|//)+\s*")
 _WHOLE = "check that the file is complete"
 _DAMAGED = (OSError, ValueError, EOFError, LookupError, MemoryError, RuntimeError, zipfile.BadZipFile, zlib.error)
 _PICKLE = "a Python pickle, which could run code", "np.savez in the program that wrote it"
+_ECHO = (
+    "text of `rostopic echo`",
+    "rostopic echo -p TOPIC > run.csv, or in ROS 2 a bag: ros2 bag record -s mcap TOPIC",
+)
+_PAGE = "a web page", "download the file itself"
 _OTHERS = {
     b"SQLite format 3\0": (
         "a SQLite bag (.db3)", "ros2 bag convert -i BAG -o out.yaml, with storage_id: mcap in out.yaml"
@@ -38,9 +44,21 @@ _OTHERS = {
     b"\x1f\x8b": ("compressed by gzip", "gunzip FILE"),
     b"\x89HDF": ("HDF5", "h5py: np.savez('run.npz', **{k: f[k][()] for k in f})"),
     b"MATLAB 5.0": ("a MATLAB file", "scipy: np.savez('run.npz', **scipy.io.loadmat(FILE))"),
+    b"MATLAB 7.3": ("a MATLAB file", "MATLAB: save('run.mat', '-v7'), then scipy.io.loadmat and np.savez"),
     b"ULog\x01": ("a PX4 log", "ulog2csv FILE (pip install pyulog)"),
     b"\x93NUMPY": ("a single array without names", "numpy: np.savez('run.npz', t_s=..., q_rad=..., goal_rad=...)"),
+    b"MDF ": ("a measurement file (MDF)", "asammdf: MDF(FILE).export('csv', 'run.csv')"),
+    b"TDSm": ("a LabVIEW file (TDMS)", "nptdms: TdmsFile.read(FILE).as_dataframe().to_csv('run.csv')"),
+    b"BZh": ("compressed by bzip2", "bunzip2 FILE"),
+    b"\xfd7zXZ": ("compressed by xz", "unxz FILE"),
+    b"header:\n": _ECHO,
+    b"layout:\n": _ECHO,
+    b"version https://git-lfs": ("a pointer of Git LFS, not the file", "git lfs pull"),
+    b"<!DOCTYPE": _PAGE,
+    b"<html": _PAGE,
     b"ARROW1": ("an Arrow file", "pandas: pd.read_feather(FILE).to_csv('run.csv', index=False)"),
+    b"\x80\x02": _PICKLE,
+    b"\x80\x03": _PICKLE,
     b"\x80\x04": _PICKLE,
     b"\x80\x05": _PICKLE,
 }  # fmt: skip
@@ -200,7 +218,8 @@ def open_tables(path: Path, episode: int | None = None) -> list[Table]:
     if head[:2] == b"PK":
         return [_read_npz(path)]
     if re.search(rb"[\0-\x08\x0e-\x1a]", head):
-        is_utf_16 = head[:2] in (b"\xff\xfe", b"\xfe\xff") or head[1::2].count(0) > len(head) // 4
+        odd, even = head[1::2].count(0), head[::2].count(0)
+        is_utf_16 = head[:2] in (b"\xff\xfe", b"\xfe\xff") or (odd > len(head) // 4 and even < len(head) // 50)
         raise UsageError(
             f"{path} is {'UTF-16 text' if is_utf_16 else 'binary'}, which import does not read",
             hint="save it as UTF-8 CSV, JSON, npz, Parquet or MCAP",
@@ -225,7 +244,7 @@ def refuse_container(path: Path, head: bytes) -> None:
     """Raise an error for a container of another kind, which names the command that converts it."""
     for magic, (what, command) in _OTHERS.items():
         if head.startswith(magic):
-            raise UsageError(f"{path} is {what}, which import does not read", hint=f"convert it: {command}")
+            raise UsageError(f"{path} is {what}, which import does not read", hint=f"first: {command}")
 
 
 def _read_npz(path: Path) -> Table:
@@ -239,10 +258,19 @@ def _read_npz(path: Path) -> Table:
                     pickled = "it holds Python objects, which are never loaded"
                     table.broken[name] = pickled if "pickle" in str(error) else f"it is damaged ({error})"
                     continue
+                if isinstance(values, bytes):
+                    continue
                 for column in values.dtype.names or ("",):
                     table.add(f"{name}.{column}" if column else name, values[column] if column else values)
     except _DAMAGED as error:
         raise UsageError(f"{path} is no npz, or is cut off: {error}", hint=_WHOLE) from None
+    if not table.keys and arrays.files:
+        is_book = any(name.startswith("xl/") for name in arrays.files)
+        what = "an Excel workbook" if is_book else f"a zip archive of {', '.join(arrays.files[:5])}"
+        raise UsageError(
+            f"{path} is {what}, which import does not read",
+            hint=f"first: {'save the sheet as CSV' if is_book else 'unzip it'}",
+        )
     return table
 
 
@@ -253,6 +281,10 @@ def _read_json(path: Path, text: str) -> Table:
             document: Json = json.loads(text)
         except json.JSONDecodeError:
             document = [json.loads(line) for line in text.splitlines() if line.strip()]  # an object on each line
+            if all(isinstance(row, dict) and {"topic", "log_time", "data"} <= row.keys() for row in document):
+                from sim2real.log.importing import bags  # imported late, as above
+
+                return bags.read_messages(path, document)
         for name, value in _leaves({"": document} if isinstance(document, list) else document, path):
             table.add(name, value)
     except UsageError:
@@ -339,17 +371,25 @@ def _is_unclear(data: Sequence[tuple[int, list[str]]], width: int, is_nameless: 
 
 
 def _names(above: Sequence[tuple[int, str]], separator: str | None, width: int) -> tuple[list[str] | None, int]:
-    """Return the names of the columns, None without any, and the number of their line."""
+    """Return the names of the columns, None without any, and the number of their line.
+
+    Below the names there may be a line of units; above names that repeat, a line of groups.
+    """
+    below: list[str] = []
     for i, line in reversed(above):
         text = _COMMENT.sub("", line, count=1) if _COMMENT.match(line) else line
         # The line of names may be separated in another way than the numbers.
         split = [[c.strip() for c in _cells(text, by)] for by in (separator, ",", None)]
         cells = next((cells for cells in split if len(cells) == width and any(cells)), None)
+        if cells is not None and below:
+            return [f"{upper} {lower}".strip() for upper, lower in zip(cells, below, strict=True)], i
         if cells is not None:
-            return cells, i
-        if not _COMMENT.match(line):  # a line of another width is text, and above it there are no names
+            if len({*cells}) == width > 1 and not all(map(is_unit, cells)):
+                return cells, i
+            below, at = cells, i
+        elif not _COMMENT.match(line):  # a line of another width is text, and above it there are no names
             break
-    return None, 0
+    return (below, at) if below else (None, 0)
 
 
 def numbers(texts: Sequence[str]) -> np.ndarray | str | None:

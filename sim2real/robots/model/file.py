@@ -31,7 +31,8 @@ def read_file(path: Path, contacts: bool) -> tuple[Any, list[str]]:
         UsageError: When the file is missing, or MuJoCo cannot read or compile it.
     """
     if not path.is_file():
-        raise UsageError(f"there is no model {path}", hint="name an MJCF or URDF file with --mjcf")
+        why = f"the model {path} is a folder" if path.is_dir() else f"there is no model {path}"
+        raise UsageError(why, hint="name an MJCF or URDF file with --mjcf")
     omitted: list[str] = []
     notes: list[str] = []
     packaged = False

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 from sim2real.errors import UsageError
+from sim2real.log.importing.mapping import LENGTHS_AND_ANGLES
 from sim2real.stages.flag import Flag, check_rate
 
 
@@ -54,10 +55,10 @@ class ImportConfig:
         if self.out is not None and len(self.files) > 1 and not self.together:
             raise UsageError(f"out names one log, but there are {len(self.files)} files", hint="import them one by one")
         if self.unit is not None and not re.fullmatch(
-            r"rad|deg|rev|mrad|m|mm|counts:[1-9][0-9]*|hundredths", self.unit
+            f"{'|'.join(LENGTHS_AND_ANGLES)}|counts:[1-9][0-9]*|hundredths", self.unit
         ):
             raise UsageError(
-                f"unknown unit {self.unit!r}. Available: rad, deg, rev, mrad, m, mm, counts:N, hundredths",
+                f"unknown unit {self.unit!r}. Available: {', '.join(LENGTHS_AND_ANGLES)}, counts:N, hundredths",
                 hint="counts:4096 for an encoder with 4096 counts a turn",
             )
 
