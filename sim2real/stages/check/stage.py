@@ -481,7 +481,7 @@ def cut_segments(episodes: Sequence[Episode], config: IdentifyConfig) -> tuple[l
             f"the shortest recording lasts {min(e.duration_s for e in episodes):.2f} s: too short for a segment",
             hint="record for at least 12 s",
         )
-    spans = [Span(r, begin) for r, e in enumerate(episodes) for begin in side_by_side(e, config, length_s)]
+    spans = side_by_side(episodes, config, [length_s] * len(episodes))
     if len(spans) > _MAX_SEGMENTS:
         spans = [spans[i] for i in np.linspace(0, len(spans) - 1, _MAX_SEGMENTS).round().astype(int)]
     return spans, length_s

@@ -19,7 +19,6 @@ from sim2real.identification.model import ChecksLogs, IdentifiableModel
 from sim2real.identification.parameters import ParameterTable
 from sim2real.identification.predictions import NOISE, Position, positions
 from sim2real.identification.residuals import Problem
-from sim2real.identification.segments import Span
 from sim2real.robots.robot import RecordedRobot, watched
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.shared.identification import identified_robot, side_by_side
@@ -101,12 +100,8 @@ def _problem(
     ahead_s = max([h for h in horizons if config.settle_s + h <= length_s + 1e-9], default=length_s - config.settle_s)
 
     # Cut the logs; parts without motion are dropped.
-    spans = [
-        Span(r, begin)
-        for r, episode in enumerate(episodes)
-        for begin in side_by_side(episode, config, length_s)
-        if _moves(model, episode, begin, length_s)
-    ]
+    spans = side_by_side(episodes, config, [length_s] * len(episodes))
+    spans = [s for s in spans if _moves(model, episodes[s.recording], s.begin_s, length_s)]
     seconds = sum(e.duration_s for e in episodes)
     if len(spans) < _LEAST or seconds < _LEAST_S:
         moving = f", {length_s * len(spans):.1f} s of them in motion,"

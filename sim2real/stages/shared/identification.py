@@ -154,10 +154,15 @@ def covering(ends: Sequence[tuple[float, float]], length_s: float) -> list[Span]
     return segments
 
 
-def side_by_side(episode: Episode, config: IdentifyConfig, length_s: float) -> list[float]:
-    """Return the begins of segments of a length, side by side, in the usable part of a log [s]."""
-    begin, end = usable(episode, config)
-    return np.arange(begin, end - length_s + 1e-6, length_s).tolist()
+def side_by_side(
+    episodes: Sequence[Episode], config: IdentifyConfig, lengths_s: Sequence[float], fitted: bool = True
+) -> list[Span]:
+    """Return segments side by side in the usable parts of logs, of a length for each log [s]."""
+    segments: list[Span] = []
+    for r, (episode, length_s) in enumerate(zip(episodes, lengths_s, strict=True)):
+        begin, end = usable(episode, config)
+        segments += [Span(r, float(b), fitted) for b in np.arange(begin, end - length_s + 1e-6, length_s)]
+    return segments
 
 
 def usable(episode: Episode, config: IdentifyConfig) -> tuple[float, float]:

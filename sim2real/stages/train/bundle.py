@@ -14,7 +14,6 @@ from sim2real.artifacts.episodes import Episodes
 from sim2real.artifacts.identification import ROUND_TRIP
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.sensitivity import Sensitivity
-from sim2real.errors import Sim2RealError
 from sim2real.graph.base import GraphState, InputState, StepState
 from sim2real.graph.episode import named_leaves
 from sim2real.policy.bundle import PolicyReference, make_runner
@@ -125,8 +124,6 @@ def has_readings(robot: Robot, recording: Recording) -> bool:
 def _observations(robot: Robot, recording: Recording, runner: PolicyRunner) -> np.ndarray:
     """Return the observations ``(N, O)`` that a policy would get from a recording's measurements."""
     agent: Any = robot.task.make_agent(robot.drive.rate_hz)
-    if not (hasattr(agent, "observe") and hasattr(agent, "act")):
-        raise Sim2RealError(f"a {type(agent).__name__} has no `observe` and `act`, which a policy needs")
 
     # Arrange the recorded readings as the leaves of a message.
     leaves, form = jax.tree_util.tree_flatten(robot.drive.at_rest)

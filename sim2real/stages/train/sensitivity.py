@@ -1,8 +1,8 @@
 """Sensitivity of a policy: its success in simulation with each parameter moved by multiples of its uncertainty."""
 
-import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,6 @@ from sim2real.artifacts.identification import ROUND_TRIP, Identification
 from sim2real.artifacts.posterior import TRANSFORMS, Posterior, from_scale
 from sim2real.artifacts.sensitivity import Moved, Sensitivity
 from sim2real.artifacts.timing import Timing
-from sim2real.errors import UsageError
 from sim2real.identification.rollouts import jitted
 from sim2real.robots.loop import DELAY_SPREAD_S, DELAYS, split_delay
 from sim2real.robots.robot import Robot
@@ -21,10 +20,8 @@ from sim2real.stages.train.config import TrainConfig
 from sim2real.stages.train.setup import prepare
 from sim2real.training.config import PPOConfig
 from sim2real.training.environment.graph_environment import GraphEnvironment
-from sim2real.training.environment.tasks import TrainingTask
 from sim2real.training.networks.policy import Policy
 from sim2real.training.ppo.rollout import evaluate
-from sim2real.types import Array
 
 TIMELINES = 8
 """Timelines that the episodes are drawn from."""
@@ -156,10 +153,10 @@ def sensitivity(
     # One episode for each copy; a rollout is as long as an episode.
     rows = env.length + 1
     config = PPOConfig(num_envs=_EPISODES, minibatches=1, rollout_steps=rows, eval_steps=rows)
-    key = jax.random.key(seed)
+    key, task = jax.random.key(seed), cast(LoopTask, env.task)
 
     def play(values: dict[str, jax.Array]) -> jax.Array:
-        environment = GraphEnvironment(env.graph, moved_task(env.task, values))
+        environment = GraphEnvironment(env.graph, task.with_data((values, {})))
         return evaluate(environment, config, policy, key)["success"]
 
     # The first model has the estimates; the others are those of the moves, in order.
@@ -167,12 +164,3 @@ def sensitivity(
     by_move = zip(moves, success[1:].reshape(len(moves), len(MULTIPLES)), strict=True)
     moved = [Moved(m.name, m.unit, m.estimate, m.half_width, m.values, s) for m, s in by_move]
     return Sensitivity.of(MULTIPLES, float(success[0]), _EPISODES, moved)
-
-
-def moved_task(task: TrainingTask, values: Mapping[str, Array]) -> LoopTask:
-    """Return a task whose episodes all have the same parameters, which may be traced."""
-    if not isinstance(task, LoopTask):
-        raise UsageError(f"the parameters of a {type(task).__name__} cannot be moved", hint="add --no-sensitivity")
-    moved = copy.copy(task)
-    moved.values, moved.draws = dict(values), {}
-    return moved

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ from sim2real.artifacts.episodes import Episodes, Varied
 from sim2real.artifacts.identification import ROUND_TRIP, Identification, Noise
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.graph.node import TICKS_PER_S, BaseNode
+from sim2real.graph.node import TICKS_PER_S
 from sim2real.robots.loop import AGENT, DELAY_SPREAD_S, DELAYS, SENSOR, WORLD
 from sim2real.robots.nodes import SimSensor
 from sim2real.robots.robot import RecordedRobot, Robot
@@ -21,7 +22,6 @@ from sim2real.robots.training import LoopTask, training_loop
 from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.stages.load import defaults_of, moving
 from sim2real.stages.shared.arguments import in_world_of
-from sim2real.stages.terminal.console import note
 from sim2real.stages.train.config import TrainConfig
 from sim2real.training.environment.draws import draw_robots, without_default_ranges
 from sim2real.training.environment.graph_environment import GraphEnvironment
@@ -94,7 +94,7 @@ def prepare(
     nodes, task = training_loop(robot, values, draws, recorded.computation if recorded else {}, delayed, spread_s)
     if recorded:
         recorded.set_transport(nodes)
-    noise = _set_noise(nodes[SENSOR], identification, config)
+    noise = _set_noise(cast(SimSensor, nodes[SENSOR]), identification, config)
 
     # Draw timelines, and compile them into index tables.
     drawn = draw_timelines(nodes, AGENT, config.episode_s, config.timelines, config.seed, recorded)
@@ -182,7 +182,7 @@ def _replaced(values: Mapping[str, float], changed: Mapping[str, float]) -> dict
 # -- the differences between episodes, as distributions to show
 
 
-def _set_noise(sensor: BaseNode, identification: Identification | None, config: TrainConfig) -> tuple[Noise, ...]:
+def _set_noise(sensor: SimSensor, identification: Identification | None, config: TrainConfig) -> tuple[Noise, ...]:
     """Give the simulated sensor the noise of the log; return it.
 
     Readings that no log determines, such as the orientation of a robot in a stand, keep the robot's nominal noise. So
@@ -190,9 +190,6 @@ def _set_noise(sensor: BaseNode, identification: Identification | None, config: 
     """
     factor = config.vary.noise
     if identification is None or not identification.noise or not factor:
-        return ()
-    if not isinstance(sensor, SimSensor):
-        note(f"readings are exact: {type(sensor).__name__} takes no noise, as sim2real.robots.nodes.SimSensor does")
         return ()
     nominal = {n.field: n for n in sensor.noise}
     logged = {n.field: n for n in identification.noise}

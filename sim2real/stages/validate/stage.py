@@ -26,7 +26,7 @@ from sim2real.identification.held_out import moving
 from sim2real.identification.model import IdentifiableModel, measured_channels
 from sim2real.identification.predictions import positions
 from sim2real.identification.residuals import Problem
-from sim2real.identification.segments import Span, check_log, extents
+from sim2real.identification.segments import check_log, extents
 from sim2real.identification.verdict import ACCEPTED
 from sim2real.robots.robot import RecordedRobot, Robot
 from sim2real.stages.identify.config import IdentifyConfig
@@ -319,11 +319,10 @@ def _windows(
         seconds: Length of the predictions of each log [s].
         like: Another problem of these logs; both share programs.
     """
-    spans, ends_s = list[Span](), list[float]()
-    for r, (log, own_s) in enumerate(zip(logs, seconds, strict=True)):
-        begins = side_by_side(log.episode, config, config.settle_s + own_s)
-        begins = begins[:1] if free_run else begins
-        spans += [Span(r, begin, False) for begin in begins]
-        ends_s += [config.settle_s + own_s] * len(begins)
-    like = like or Problem(model, [log.episode for log in logs], spans, max(ends_s), config)
+    episodes, lengths_s = [log.episode for log in logs], [config.settle_s + own_s for own_s in seconds]
+    spans = side_by_side(episodes, config, lengths_s, fitted=False)
+    if free_run:
+        spans = [next(s for s in spans if s.recording == r) for r in range(len(logs))]
+    ends_s = [lengths_s[s.recording] for s in spans]
+    like = like or Problem(model, episodes, spans, max(ends_s), config)
     return like.recut(spans, max(ends_s), ends_s=ends_s)
