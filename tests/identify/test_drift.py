@@ -183,11 +183,20 @@ def test_the_size_is_that_of_generalised_least_squares():
     at = Linearised(r, J, np.eye(2), np.zeros(2), r)
     step, own, before, _ = _beside_the_rest(at, WAY_OF_TWO, np.linalg.cholesky(open_now), variance)
     flat, along = J.reshape(36, 2), J.reshape(36, 2)[:, 1]
-    inverse = np.linalg.inv(variance * np.eye(36) + flat @ open_now @ flat.T)
-    assert step == pytest.approx(-along @ inverse @ r.reshape(36) / (along @ inverse @ along))
-    weights = inverse @ along / (along @ inverse @ along)
+
+    def again(variance):
+        inverse = np.linalg.inv(variance * np.eye(36) + flat @ open_now @ flat.T)
+        return inverse @ along / (along @ inverse @ along)
+
+    weights = again(variance)
+    assert step == pytest.approx(-weights @ r.reshape(36))
     assert before == pytest.approx(weights @ flat @ open_now @ flat.T @ weights)
-    assert own >= 0.5 * variance * weights @ weights
+    # Its variance is at least that of residuals whose size differs from segment to segment.
+    uneven = np.mean(r.reshape(12, 3) ** 2, axis=1) / np.mean(r**2)
+    least = variance * np.sum(weights.reshape(12, 3) ** 2, axis=1) @ uneven
+    assert least <= own * (1 + 1e-9)
+    calm = _beside_the_rest(at, WAY_OF_TWO, np.linalg.cholesky(open_now), 50.0 * variance)[1]
+    assert calm == pytest.approx(50.0 * variance * np.sum(again(50.0 * variance).reshape(12, 3) ** 2, axis=1) @ uneven)
 
 
 def test_what_a_log_does_not_feel_is_not_tested():

@@ -18,6 +18,7 @@ from sim2real.artifacts.identification import (
 from sim2real.identification import lacks
 from sim2real.identification.lacks import farthest_run, find_lack, largest_residual, unexplained_second
 from sim2real.identification.predictions import Position
+from sim2real.identification.residuals import Linearised
 from sim2real.stages.identify import judgement
 
 AXIS, ARM = Position("x[0]", "axis", "m", 1e-5), Position("x[1]", "arm", "rad", 1e-3)
@@ -70,6 +71,15 @@ def test_gravity_of_another_direction_is_named_first_with_its_command(times_nois
     assert ("+0.70 rad (tilt_y)" in found.reasons[0]) == named
     assert found.flags.startswith("--terms drag,tilt --bounds tilt_x -3.15" if named else "")
     assert bool(found.flags) == named
+
+
+@pytest.mark.parametrize(("turned", "promising"), [(2.0, True), (0.0, False)])
+def test_gravity_is_turned_where_a_small_turn_would_help_beside_all_others(turned, promising):
+    rng = np.random.default_rng(0)
+    J = rng.normal(size=(5, 40, 1, 3))
+    r = rng.normal(size=(5, 40, 1)) + J @ np.array([3.0, -2.0, turned])  # others explain what they can
+    at = Linearised(r, J, np.eye(3), np.zeros(3), r)
+    assert lacks._promises(at, np.array([False, False, True])) is promising
 
 
 @pytest.mark.parametrize(("times_noise", "share", "named"), [(2.0, 0.5, False), (8.0, 0.5, True), (8.0, 0.3, False)])

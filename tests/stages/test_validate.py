@@ -18,9 +18,10 @@ from sim2real.artifacts.identification import (
 from sim2real.artifacts.posterior import Posterior
 from sim2real.artifacts.recording import Recording
 from sim2real.errors import UsageError
+from sim2real.log import read_log
 from sim2real.stages.load import load_robot
 from sim2real.stages.shared.arguments import open_recording
-from sim2real.stages.shared.identification import identified_robot
+from sim2real.stages.shared.identification import identified_robot, usable
 from sim2real.stages.validate import stage
 from sim2real.stages.validate.config import ValidateConfig
 from sim2real.stages.validate.stage import Validation
@@ -115,6 +116,18 @@ def test_each_log_is_scored_alone_and_a_bad_one_does_not_stop_the_others():
     assert alone.error == pytest.approx(ahead[good.path.name].error, rel=0.02)  # programs of other sizes
     with pytest.raises(UsageError, match="lacking"):
         stage.score(found, pipeline, [lacking])
+
+
+def test_a_short_log_has_a_shorter_free_run_and_one_that_is_too_short_is_refused():
+    pipeline, found = identification()
+    free = ExpectedError("hinge", "rad", 9.0, 1.0, free_run=True)
+    found = replace(found, expected_error=(*found.expected_error, free))
+    short, shorter = (Recording(Path(f"{s} s"), read_log(LOGS[0], 0.0, s)) for s in (3.0, 0.6))
+    begin, end = usable(short.episode, identified_robot(found, pipeline)[1])
+    scored = stage.score(found, pipeline, [short, shorter])
+    assert [e.seconds for e in scored.errors if e.free_run] == [pytest.approx(end - begin - 0.3)]
+    assert 2.0 < end - begin - 0.3 < 2.7
+    assert set(scored.refused) == {"0.6 s"}
 
 
 @pytest.mark.parametrize(("deviation", "unsteady"), [(0.5, {"chirp.mcap": ["hinge"]}), (1e-6, {})])
