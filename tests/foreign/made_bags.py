@@ -29,7 +29,6 @@ TYPES = {
     "demo/msg/Note": "wstring text\n",
     "demo/msg/Lost": "demo/Absent inner\n",
     "demo/msg/Loop": f"demo/Loop inner\n{LINE}MSG: demo/Loop\ndemo/Loop inner\n",
-    "demo/msg/Empty": "",
     "demo/msg/Many": f"demo/Empty[] many\n{LINE}MSG: demo/Empty\n",
     "demo/msg/Text": "string text\n",
     "tf2_msgs/msg/TFMessage": "float64[] transforms\n",

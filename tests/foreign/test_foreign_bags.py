@@ -73,6 +73,9 @@ def test_a_bag_without_a_clock_in_order_asks_for_its_rate(tmp_path):
     [
         ("demo/msg/Lost", b"\0\1\0\0"),
         ("demo/msg/Many", b"\0\1\0\0\xff\xff\xff\xff"),
+        ("demo/msg/Loop", b"\0\1\0\0"),
+        ("demo/msg/Note", b"\0\1\0\0\2\0\0\0h\0i\0"),
+        ("tf2_msgs/msg/TFMessage", b"\0\1\0\0\0\0\0\0\0\0\0\0"),
         (STATE, b"\0\1\0\0\1"),
         (IMAGE, b"\0\1\0\0" + bytes(40)),
         ("demo/msg/Text", b"\0\1\0\0\2\0\0\0h\0"),

@@ -110,7 +110,7 @@ def test_gains_and_torque_that_is_switched_make_inputs(workplace, recorded):
     assert ParameterPattern("kd") in own.terms
 
 
-def test_an_imported_log_is_taken_as_it_is(workplace, capsys):
+def test_an_imported_log_is_taken_as_it_is_and_a_mapping_that_the_data_contradict_is_refused(workplace, capsys):
     assert cli.main(["import", "run.npz", "--mjcf", "robot.xml", "--out", "run.mcap"]) == 0
     out, err = capsys.readouterr()
     assert "positions follow their goals" in err
@@ -120,6 +120,18 @@ def test_an_imported_log_is_taken_as_it_is(workplace, capsys):
     assert found.mapping is None
     assert found.robot.commands == ("goal",)
     assert cli.main(["import", "run.npz", "--mapping", "run.import.toml", "--out", "again.mcap"]) == 0
+    # A mapping that the data contradict is refused.
+    text = Path("run.import.toml").read_text()
+    swapped = text.replace('source = "goal_rad"', 'source = ["goal_rad[:,1]", "goal_rad[:,0]"]')
+    assert swapped != text
+    Path("wrong.toml").write_text(swapped)
+    capsys.readouterr()
+    assert cli.main(["import", "run.npz", "--mapping", "wrong.toml", "--out", "wrong.mcap"]) == 2
+    assert "joint 0 follows the goal of joint 1" in capsys.readouterr().err
+    assert not Path("wrong.mcap").exists()
+    assert cli.main(["import", "run.npz", "--mapping", "wrong.toml", "--out", "wrong.mcap", "--as-told"]) == 0
+    with pytest.raises(UsageError, match="contradict"):
+        describe_robot(RobotFlags(mjcf=Path("robot.xml"), mapping=Path("wrong.toml")), ["run.npz"])
 
 
 def test_new_writes_a_pipeline_that_loads(workplace):
@@ -203,21 +215,6 @@ def test_wrong_commands_are_refused_before_anything_is_compiled(workplace, capsy
     assert cli.main(arguments) == 2
     assert named in capsys.readouterr().err
     assert not Path("pipelines").exists()
-
-
-def test_a_mapping_that_the_data_contradicts_is_refused(workplace, capsys, recorded):
-    assert cli.main(["import", "run.npz", "--mjcf", "robot.xml", "--out", "run.mcap"]) == 0
-    text = Path("run.import.toml").read_text()
-    swapped = text.replace('source = "goal_rad"', 'source = ["goal_rad[:,1]", "goal_rad[:,0]"]')
-    assert swapped != text
-    Path("wrong.toml").write_text(swapped)
-    capsys.readouterr()
-    assert cli.main(["import", "run.npz", "--mapping", "wrong.toml", "--out", "wrong.mcap"]) == 2
-    assert "joint 0 follows the goal of joint 1" in capsys.readouterr().err
-    assert not Path("wrong.mcap").exists()
-    assert cli.main(["import", "run.npz", "--mapping", "wrong.toml", "--out", "wrong.mcap", "--as-told"]) == 0
-    with pytest.raises(UsageError, match="contradict"):
-        describe_robot(RobotFlags(mjcf=Path("robot.xml"), mapping=Path("wrong.toml")), ["run.npz"])
 
 
 @pytest.mark.parametrize(("name", "told"), [("disk", True), ("rig", False)])
