@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sim2real.artifacts.identification import ComparedError, Identification, Judgement
+from sim2real.artifacts.identification import ComparedError, Identification, Internal, Judgement
 from sim2real.identification.expected import wider_for, with_expected_errors
 from sim2real.identification.held_out import HeldOutPart
 from sim2real.identification.predictions import Position
@@ -77,13 +77,18 @@ def test_it_is_not_below_the_noise_and_a_joint_at_rest_is_not_compared():
 def test_the_error_on_all_held_out_data_is_that_of_the_only_log(names):
     rows, parts = samples(0.01), [part("a", 0.01, 0.01), part("b", 0.02, 0.01)]
     whole = ComparedError("", JOINT.name, "rad", 2.0, 0.01, baselines={"standing still": 0.5})
-    document = Identification("robot", (), Judgement("", ()), (), errors=(whole,), samples=rows, free=rows)
+    settled = Internal(settle_s=0.1)
+    document = Identification(
+        "robot", (), Judgement("", ()), (), errors=(whole,), samples=rows, free=rows, internal=settled
+    )
     found = with_expected_errors(document, [JOINT], parts, names, [{}] * len(names))
     (overall,) = found.held_out
     assert overall.baselines == {"standing still": 0.5}
     assert (overall.expected is not None) == (len(names) == 1)
     assert len([e for e in found.errors if not e.free_run]) == len(names)
     assert "" in {e.log for e in found.judged}
+    assert {e.seconds for e in found.errors if not e.free_run} == {2.0}, "the horizon, although samples end before it"
+    assert [e.seconds for e in found.errors if e.free_run] == [pytest.approx(1.85)]
 
 
 def motion(low, high, speed):

@@ -164,6 +164,8 @@ def test_a_delay_whose_bounds_were_narrowed_gets_wider_ones():
     for longest, flags in ((0.06, "--max-delay-s 0.12"), (0.9, "--max-delay-s 1"), (1.0, "")):
         (late,) = [replace(p, high=longest) for p in table if p.name == "sensor_delay"]
         assert verdict.way_out(late, upper=True, max_delay_s=longest) == flags
+    share = Parameter("share", "1", 0.2, 0.1, 0.5, "linear")
+    assert verdict.way_out(share, upper=False, max_delay_s=0.06) == "--bounds share 0 0.5", "it is not negative"
 
 
 def test_what_nothing_determines_is_not_helped_by_other_bounds():
@@ -189,7 +191,7 @@ def test_a_term_that_halves_the_error_comes_before_a_parameter_that_nothing_dete
     assert found.reasons[0] == "direction lowers the error by 62%"
 
 
-@pytest.mark.parametrize(("share", "others"), [(0.995, 0.01), (0.6, 0.01), (0.995, 0.15)])
+@pytest.mark.parametrize(("share", "others"), [(0.995, 0.01), (0.995, None), (0.6, 0.01), (0.995, 0.15)])
 def test_a_part_that_alone_determines_a_parameter_is_named_where_it_decides_the_expected_error(share, others):
     shares = [{"gain": 0.3, "damping": (1.0 - share) / 2}, {"gain": 0.4, "damping": share}, {"gain": 0.3, "damping": 0}]
     errors = (0.008, 0.2, others)
@@ -197,7 +199,7 @@ def test_a_part_that_alone_determines_a_parameter_is_named_where_it_decides_the_
     parts = [HeldOutPart(name, {}, of, {"th": error, "tilt": None}) for name, of, error in rows]
     expected = [ExpectedError(c, "rad", 1.0, 0.25) for c in ("tilt", "th")]
     sentence = verdict.decisive_part(parts, expected, {"th": "th", "tilt": "tilt"})
-    assert bool(sentence) == (share > 0.99 and others < 0.1)
+    assert bool(sentence) == (share > 0.99 and (others or 0.0) < 0.1)
     assert ("damping" in sentence) == bool(sentence)
     assert "gain" not in sentence
     assert verdict.advised(["another", sentence]).endswith(" b") == bool(sentence)

@@ -33,9 +33,11 @@ def episode(seconds=10.0, took_s=0.001):
     return Episode(steps={"agent": steps}, messages={}, outputs={})
 
 
-def deployed(identified=0.01, here=0.01, success=1.0, simulated=1.0, drift=STEADY, took_s=0.001, seconds=10.0):
+def deployed(
+    identified=0.01, here=0.01, success=1.0, simulated=1.0, drift=STEADY, took_s=0.001, seconds=10.0, expected=0.01
+):
     """A deployment: how far models are off, how well it went, what has changed, and how long steps took."""
-    models = {"baselines": {AS_HERE: here, "standing still": 0.5}, "expected": 0.01}
+    models = {"baselines": {AS_HERE: here, "standing still": 0.5}, "expected": expected}
     rows = (ComparedError("this deployment", "hinge", "rad", 0.1, identified, **models),)
     logs = tuple(Recording(Path(f"runs/pendulum/T/deploy/episode_{i}.mcap"), episode(seconds, took_s)) for i in (0, 1))
     real, late = {"success": success}, [simulation.late_shares(log, BUNDLE) for log in logs]
@@ -52,6 +54,7 @@ def deployed(identified=0.01, here=0.01, success=1.0, simulated=1.0, drift=STEAD
         ({"drift": ALARM, "success": 0.7}, "re-identify", "friction is 12 rad/s^2", "CHANGED"),
         # A change that harms nobody is said, and decides nothing.
         ({"drift": ALARM}, "fine", "success is 1.00", "SUCCESS CHANGED"),
+        ({"identified": 0.5, "here": 0.4, "expected": None}, "fine", "success is 1.00", "SUCCESS HOLDS"),
         ({"identified": 0.0101}, "re-identify", "10 mrad were expected", "WRONG"),
         ({"identified": 0.02, "drift": LIKELY}, "re-identify", "10 mrad were expected", "WRONG LIKELY"),
         ({"identified": None}, "re-identify", "hinge diverges", "WRONG"),
