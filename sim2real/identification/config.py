@@ -11,30 +11,36 @@ class FitConfig:
     """From segments of recordings to an estimate: search, then refine."""
 
     max_delay_s: float = 0.06
-    """Upper bound of the delay on either side of the world [s]; the round trip is at most twice as long."""
+    """Longest delay of commands, and longest delay of measurements [s]; the round trip is at most twice as long."""
     initial_state: Literal["free", "measured", "rest"] = "free"
-    """State at a segment's start: 'free' fits it, 'measured' reads it off the samples, 'rest' has no velocity."""
+    """State at a segment's start: 'free' fits it, 'measured' estimates it from the samples, 'rest' sets the velocity to
+    0.
+    """
     skip_s: float = 0.0
     """First part of a segment that is simulated but not compared, so that unmeasured states settle [s]."""
     reach: float = 5.0
-    """Residual above which the loss grows more slowly than its square [deviations of the measurement]; inf: nowhere."""
+    """Residual above which the loss grows less than quadratically [standard deviations of the measurement]; inf:
+    nowhere.
+    """
     strategy: str = "CMA_ES"
     """Search algorithm: any name in evosax.algorithms."""
     population: int = 32
-    """Candidates a generation."""
+    """Candidates in each generation of the search."""
     generations: int = 0
     """Most generations of a global search before the refinement from its best candidate and the nominal values."""
     std: float = 0.7
-    """Spread of the first generation; 1 covers about half of the bounds' width."""
+    """Spread of the first generation; 1 covers about half of the range between the bounds."""
     refine_steps: int = 25
-    """Largest number of steps of Levenberg-Marquardt in a round, of which there are up to four."""
+    """Largest number of Levenberg-Marquardt steps in a round; a descent has up to four rounds."""
     long_s: float | None = 0.0
-    """Length of the segments of a last refinement [s]; 0, or logs shorter than two of them, skip it. None: 5 s if no
-    goals of positions are commanded, as errors of a force add up in a free run, else 0."""
+    """Length of the segments of a last refinement [s]; 0, or a log shorter than two such segments, skips it. None: 0 if
+    commands are goals of positions; else 5 s, as errors of a force add up over a long prediction.
+    """
     engine: Literal["auto", "c", "compiled"] = "auto"
     """Simulator: C MuJoCo or the compiled graph; 'auto' takes C if the world is MuJoCo's."""
     difference: float = 1e-3
-    """Step of finite differences, as a share of the bounds' width. Large steps smooth the kinks of friction."""
+    """Step of finite differences, as a share of the range between the bounds. Large steps smooth the kinks of friction.
+    """
     seed: int = 0
     """Seed of the search."""
 

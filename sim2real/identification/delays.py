@@ -1,4 +1,4 @@
-"""The distribution of the measurements' delay, which no stamp records: mean, 95th percentile, deviation, losses.
+"""Estimates the delay of measurements, which no stamp records: mean, 95th percentile, deviation, lost messages.
 
 A measurement with stamp t shows the motion at t - d. The model predicts the motion; where it is fast, a measurement
 determines d well. The likelihood of a measurement is a sum over a grid of delays: the share of each delay times the
@@ -19,27 +19,29 @@ from sim2real.identification.parameters import ParameterTable
 from sim2real.identification.residuals import Problem
 
 _STEP_S = 0.001
-"""Distance of the delays at which the motion is predicted [s]."""
+"""Step between the delays at which the motion is predicted [s]."""
 _LOST = 0.5
-"""Probability of a loss from which on a repeated value counts as lost; below, its delay counts as the others do."""
+"""A repeated value counts as a lost message from this probability on; otherwise it counts as a message with a delay."""
 _WIDTH = 1.96
-"""Half the width of an interval, in standard errors."""
+"""Half the width of a 95 % interval, in standard errors."""
 _BUMPS = 20
-"""Number of splines that form the logarithm of the shares: more of them allow sharper edges."""
+"""Number of splines whose sum is the logarithm of the shares: more of them allow sharper edges."""
 _RIDGE, _SMOOTH = 1e-3, 0.5
-"""Precisions of the splines' weights and of their third differences. Without the first, the share of a delay that never
-occurs is -inf; without the second, shares of neighbouring delays differ by chance."""
+"""Precisions of the priors of the splines' weights, and of the weights' third differences. Without the first, the log
+share of a delay that never occurs is -inf; without the second, shares of neighbouring delays differ by chance.
+"""
 _FLOOR = 1e-12
 """Least share of a grid point in the likelihood, so that a single measurement cannot make it infinite."""
 _FIRST_S = 0.005
-"""Assumed deviation of delays before the first estimate [s]."""
+"""Assumed standard deviation of the delays before the first estimate [s]."""
 _PARTS = 1.0, 0.25, 0.0625
-"""Parts of a step of least squares that are tried."""
+"""Shares of a step of least squares that are tried."""
 _APART, _TRIES = 2.0, 5
-"""Distance of the mean delays at which a maximum of the likelihood is looked for, in standard errors of the first
-estimate, and the most of them on a side."""
+"""Maxima of the likelihood are looked for at mean delays this far apart, in standard errors of the first estimate; and
+at how many of them, at most, on each side.
+"""
 _ROUNDS, _AGAIN = 3, 2
-"""Linearisations of least squares, and then of the likelihood."""
+"""Number of linearisations for least squares, and for the likelihood after it."""
 _STEPS = 40
 """Most steps of a maximisation."""
 _LEAST, _MOST = 40, 100
@@ -68,7 +70,7 @@ class DelayEvidence:
         return replace(self, errors=self.errors[which], jacobian=self.jacobian[which])
 
     def at(self, delays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return errors at other delays ``(K,)`` [s], and their slope by the delay [1/s]; both ``(N, F, K)``."""
+        """Return errors at other delays ``(K,)`` [s], and their derivative by the delay [1/s]; both ``(N, F, K)``."""
         step = self.delays[1] - self.delays[0]
         place = (delays - self.delays[0]) / step
         left = np.clip(np.floor(place).astype(int), 0, len(self.delays) - 2)
@@ -77,18 +79,18 @@ class DelayEvidence:
 
 
 Linearise = Callable[[np.ndarray, float], DelayEvidence]
-"""From the unknowns ``(P,)`` and a delay [s] to the linearised measurements."""
+"""Maps the unknowns ``(P,)`` and a delay [s] to the linearised measurements."""
 
 
 class Likelihood:
-    """The likelihood of all measurements over a grid of delays; a point is offsets of unknowns, log noise, weights.
+    """The likelihood of all measurements at a point ``(size,)``: changes of the unknowns, log noise, splines' weights.
 
     Args:
         grid: Shape ``(K,)``: possible delays of messages, at equal distances [s].
     """
 
     def __init__(self, evidence: DelayEvidence, grid: np.ndarray) -> None:
-        from scipy.interpolate import BSpline  # 0.6 s of each identification, which need not estimate links
+        from scipy.interpolate import BSpline  # imported late: it takes 0.6 s, and few identifications estimate links
 
         self.evidence, self.grid = evidence, grid
         self.fields, self.unknowns = evidence.jacobian.shape[1:]
@@ -101,16 +103,16 @@ class Likelihood:
         self.prior[: self.unknowns, : self.unknowns] = evidence.prior
         self.prior[-bend.shape[1] :, -bend.shape[1] :] = _SMOOTH * bend.T @ bend + _RIDGE * np.eye(bend.shape[1])
         self._errors, slopes = evidence.at(grid)
-        # A delay may lie between points of the grid: that adds noise of this variance.
+        # A delay between two points of the grid adds noise of this variance.
         self._blur = slopes.mean(axis=2) ** 2 * (grid[1] - grid[0]) ** 2 / 12.0
 
     def start(self, noise: np.ndarray, share: np.ndarray) -> np.ndarray:
-        """Return a start, ``(size,)``, from the noise ``(F,)`` and the shares ``(K,)``."""
+        """Return the point ``(size,)`` with noise ``(F,)`` and shares ``(K,)``."""
         weights = np.linalg.lstsq(self.bumps, np.log(np.maximum(share, 1e-9)), rcond=None)[0]
         return np.concatenate([np.zeros(self.unknowns), np.log(noise), weights])
 
     def noise(self, p: np.ndarray) -> np.ndarray:
-        """Return the deviation of the noise, ``(F,)``."""
+        """Return the standard deviation of the noise, ``(F,)``."""
         return np.exp(p[self.unknowns : self.unknowns + self.fields])
 
     def shares(self, p: np.ndarray) -> np.ndarray:
@@ -120,10 +122,7 @@ class Likelihood:
         return share / share.sum()
 
     def __call__(self, p: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-        """Return the logarithm of the likelihood and prior, its gradients ``(N, size)`` by row, and its rows ``(N,)``.
-
-        The gradients are those of the likelihood alone.
-        """
+        """Return the log posterior; and each row's log likelihood as gradient ``(N, size)`` and value ``(N,)``."""
         # The log likelihood of each measurement at each delay.
         unknowns, variance, share = self.unknowns, self.noise(p)[None] ** 2, self.shares(p)
         total = variance + self._blur
@@ -136,7 +135,7 @@ class Likelihood:
         whole = likely.sum(axis=1, keepdims=True)
         likely /= whole
         rows = (np.log(whole) + top)[:, 0]
-        # The gradient by unknowns, noise and splines.
+        # The gradient by unknowns, noise and weights.
         expected = np.einsum("nk,nfk->nf", likely, off) / np.sqrt(total)
         squares = np.einsum("nk,nfk->nf", likely, off**2)
         of_unknowns = -np.einsum("nf,nfp->np", expected, self.evidence.jacobian)
@@ -144,10 +143,7 @@ class Likelihood:
         return float(rows.sum() - 0.5 * p @ self.prior @ p), gradient, rows
 
     def maximise(self, p: np.ndarray) -> np.ndarray:
-        """Return the maximum near a start, by damped steps with the information matrix of the rows' gradients.
-
-        Solvers of scipy do not use these gradients.
-        """
+        """Return the maximum near a start, by damped steps; products of the rows' gradients are the curvature."""
         value, gradient, _ = self(p)
         damping = 1e-3
         for _ in range(_STEPS):
@@ -177,10 +173,10 @@ class Likelihood:
 
 
 def _along(gradient: np.ndarray) -> np.ndarray:
-    """Return the covariance of the sum of rows ``(N, size)`` that follow each other in time, ``(size, size)``.
+    """Return the covariance ``(size, size)`` of the sum of rows ``(N, size)`` that follow each other in time.
 
-    Delays of successive messages depend on each other: a timer's rise and fall periodically, a busy bus's stay long.
-    So products of gradients of messages up to a few steps apart are added (Newey and West, Econometrica 55, 1987).
+    Delays of successive messages depend on each other: behind a timer they rise and fall periodically, on a busy bus
+    they stay long. So products of rows up to a few steps apart are added (Newey and West, Econometrica 55, 1987).
     """
     lags = round(len(gradient) ** (1 / 3))
     between = gradient.T @ gradient
@@ -193,11 +189,11 @@ def _along(gradient: np.ndarray) -> np.ndarray:
 def _straight(
     evidence: DelayEvidence, delay_s: float, deviation_s: float, noise: np.ndarray, move_delay: bool = True
 ) -> tuple[np.ndarray, float, float]:
-    """Return corrections ``(P + 1,)`` of unknowns and mean delay by least squares, the delay's error, and the squares.
+    """Return corrections ``(P + 1,)`` of unknowns and mean delay, the delay's standard error, and the sum of squares.
 
     Args:
-        noise: Shape ``(F,)``: deviation of the noise, in deviations of the measurement.
-        move_delay: False: the delay stays.
+        noise: Shape ``(F,)``: standard deviation of the noise, relative to the assumed one of the measurement.
+        move_delay: False: the delay is fixed.
     """
     errors, slopes = evidence.at(np.array([delay_s]))
     weight = 1.0 / np.sqrt(noise**2 + (slopes[:, :, 0] * deviation_s) ** 2)
@@ -219,9 +215,9 @@ class Delays:
         x: Shape ``(P,)``: the unknowns of the model.
         delays: Shape ``(K,)``: a grid of delays [s].
         share: Shape ``(K,)``: share of the measurements that have each delay.
-        mean_error: Standard error of the mean by least squares, which assume no shape of the distribution [s].
+        mean_error: Standard error of the mean by least squares, without an assumption on the distribution [s].
         by_shape: Shape ``(K, M)``: d share / d weight of the splines.
-        covariance: Shape ``(M, M)``: of the weights.
+        covariance: Shape ``(M, M)``: covariance of the weights.
         place: Shape ``(F + M,)``: logarithms of the noise, and the weights of the splines.
         lost: Shape ``(N,)``: the probability that each message was lost.
     """
@@ -243,13 +239,14 @@ class Delays:
     def ranged(self, held_s: float = 0.0) -> tuple[Ranged, Ranged, Ranged]:
         """Return mean, deviation and 95th percentile with their intervals [s].
 
-        The mean's error is at least that of least squares: the likelihood's own is too small where the distribution
-        has edges that the splines cannot follow. The percentile's ends are the quantiles at 0.95 minus and plus the
-        error of the distribution there, as a quantile in a gap of the distribution has no standard error; two things
-        widen it: the part of the mean's error that the likelihood lacks, and half a step of the grid.
+        The standard error of the mean is the larger of two: by the likelihood, which is too small where the splines
+        cannot follow an edge of the distribution, and by least squares. The interval of the percentile ends at the
+        quantiles 0.95 minus and plus the error of the distribution there, because a quantile in a gap of the
+        distribution has no standard error. It is widened by what least squares add to the mean's error, and by half a
+        step of the grid.
 
         Args:
-            held_s: The sum of other delays, which is part of the mean and of the percentile [s].
+            held_s: Sum of the other delays, which is added to the mean and to the percentile [s].
         """
         likely = self._error(self.delays @ self.by_shape)
         error = max(likely, self.mean_error)
@@ -275,14 +272,14 @@ class Delays:
 
 
 def _arrived(linearise: Linearise, x: np.ndarray, delay_s: float) -> Delays:
-    """Estimate delays, noise and the unknowns of a model together, from messages none of which was lost.
+    """Estimate delays, noise and unknowns together, as if no message was lost.
 
     Args:
-        linearise: The model; called in every round with the unknowns and the mean delay.
+        linearise: Called in every round with the unknowns and the mean delay.
         x: Shape ``(P,)``: a first estimate of the unknowns.
         delay_s: A first estimate of the mean delay [s].
     """
-    # First estimates by least squares; a step that does not lower the errors is taken in part.
+    # First estimates by least squares; a step that does not lower the errors is shortened.
     evidence = linearise(x, delay_s)
     ones, first = np.ones(evidence.errors.shape[1]), (_maximum(evidence, delay_s), x)
     for _ in range(_ROUNDS):
@@ -296,19 +293,19 @@ def _arrived(linearise: Linearise, x: np.ndarray, delay_s: float) -> Delays:
                 break
         else:
             break
-    # The likelihood has several maxima: begin at delays on both sides, too, and go further while it gets larger.
+    # The likelihood has several maxima: begin at shorter and longer delays, too, and go on while it grows.
     error_s = _straight(evidence, delay_s, _FIRST_S, ones)[1]
     local = functools.cache(lambda k: _maximum(evidence, delay_s + _APART * error_s * k))
     best, step = 0, 1 if local(1)[0] > local(-1)[0] else -1
     while abs(best) < _TRIES and local(best + step)[0] > local(best)[0]:
         best += step
-    # Linearise twice more, at the best of these and near the caller's estimate: far steps may have looked too good.
+    # Linearise twice more, at the best maximum and near the caller's estimate: far away the linear model may be wrong.
     ends = []
     for (_, likelihood, p), at in (first, (local(best), x)):
         for _ in range(_AGAIN):
             begin, share = likelihood.start(likelihood.noise(p), likelihood.shares(p)), likelihood.shares(p)
-            # Take a step in part if it lowers the likelihood: where a joint sticks, its first velocity hardly changes
-            # the motion to first order, and the linearised model moves it too far.
+            # Shorten a step that lowers the likelihood: where a joint sticks, its initial velocity hardly changes
+            # # the motion to first order, and the linearised model moves it too far.
             for part in _PARTS:
                 there = at + part * p[: len(x)]
                 new = Likelihood(linearise(there, float(share @ likelihood.grid)), likelihood.grid)
@@ -331,8 +328,8 @@ def _arrived(linearise: Linearise, x: np.ndarray, delay_s: float) -> Delays:
 def _maximum(evidence: DelayEvidence, delay_s: float) -> tuple[float, Likelihood, np.ndarray]:
     """Return the largest likelihood near a mean delay [s], the likelihood, and its point.
 
-    The unknowns begin where they fit best with that delay. Then expectation and maximisation with a share for every
-    delay find the grid that covers the delays of all messages, finer than the resolution of a measurement.
+    The unknowns begin where they fit best with that delay. Then expectation-maximisation with a free share of every
+    delay finds a grid that covers the delays of all messages, and that is finer than a measurement resolves.
     """
     delay_s = float(np.clip(delay_s, evidence.delays[0], evidence.delays[-1]))
     count, fields, size = evidence.errors.shape
@@ -373,7 +370,8 @@ def links(problem: Problem, x: np.ndarray) -> tuple[Link, ...]:
         UsageError: When no delay of the measurements is identified.
     """
     late, table = measured(problem.table), problem.table
-    # Split the delay evenly between commands and measurements: that of a single measurement may be below the mean, too.
+    # Split the delay evenly between commands and measurements: single measurements may have a shorter delay than the
+    # mean.
     values = {n: np.asarray(v, np.float64) for n, v in table.decode(x).items()}
     commands = [c.name for c in table.columns if c.side == "command"]
     half_s = (float(values[late]) + sum(float(values[n]) for n in commands)) / 2.0
@@ -388,11 +386,12 @@ def links(problem: Problem, x: np.ndarray) -> tuple[Link, ...]:
 
 
 def measured(table: ParameterTable) -> str:
-    """Return the name of the measurements' delay."""
+    """Return the name of the parameter that is the measurements' delay."""
     names = sorted({p.name for p in table if p.side == "measurement"})
     if len(names) != 1 or not any(c.kind == "delay" for c in table.columns):
         raise UsageError(
-            f"links need one delay of the measurements and one that is identified, got {', '.join(names) or 'none'}",
+            "the distribution of delays needs one delay of the measurements, and an identified delay; the model's "
+            f"delays of measurements: {', '.join(names) or 'none'}",
             hint="leave --links out",
         )
     return names[0]
@@ -404,8 +403,8 @@ def find(linearise: Linearise, x: np.ndarray, delay_s: float, again: np.ndarray)
     Args:
         x: Shape ``(P,)``: a first estimate of the unknowns.
         delay_s: A first estimate of the mean delay [s].
-        again: Shape ``(N,)``, bool: measurements that repeat the previous values. Either the message was lost, or it
-            came and shows the same motion: the robot rests, or its device measures more seldom than it is read.
+        again: Shape ``(N,)``, bool: measurements that repeat the previous values: the message was lost, or the robot
+            rests, or its device measures more seldom than it is read.
     """
     first = np.maximum.accumulate(np.where(again, 0, np.arange(len(again))))
 
@@ -413,26 +412,27 @@ def find(linearise: Linearise, x: np.ndarray, delay_s: float, again: np.ndarray)
         estimate = _arrived(lambda x, about_s: linearise(x, about_s).rows(came), x, delay_s)
         likelihood = Likelihood(linearise(estimate.x, estimate.mean_s), estimate.delays)
         density = likelihood(np.concatenate([np.zeros(len(x)), estimate.place]))[2]
-        # How probable a repetition is if the message came: the density of its age over that of the new value's.
+        # How probable a repeated value is if the message came: the density of its age over that of a new value's age.
         chance = np.exp(np.minimum(density - density[first], 0.0))
         lost = _losses(again, chance)
         share = np.clip(lost.mean(), 0.5 / len(again), 0.5)
         height = np.where(again, np.log(share + (1.0 - share) * chance), np.log(1.0 - share) + density)
         return float(height.sum()), replace(estimate, lost=lost)
 
-    # Estimate from new values; then, too, from repeated ones that came, which have longer delays.
+    # Estimate from new values alone; then also from repeated values that came, which have longer delays.
     best = estimated(~again, x, delay_s)
     came = ~again | (best[1].lost < _LOST)
     if (came != ~again).any():
         best = estimated(came, best[1].x, best[1].mean_s)
-    # The repetitions of a slow device are older than any new value: compare with an estimate in which all came.
+    # Repeated values of a slow device are older than any new value: compare with an estimate in which no message is
+    # lost.
     if not came.all():
         best = max(best, estimated(np.ones_like(again), x, delay_s), key=lambda one: one[0])
     return best[1]
 
 
 def lost_share(lost: np.ndarray) -> Ranged:
-    """Return the share of lost messages; the interval is that of a binomial with a flat prior (Jeffreys)."""
+    """Return the share of lost messages, with Jeffreys' interval of a binomial proportion."""
     draws = np.random.default_rng(0).beta(lost.sum() + 0.5, len(lost) - lost.sum() + 0.5, 4000)
     low, high = np.quantile(draws, [0.025, 0.975])
     total = float(lost.mean())
@@ -443,7 +443,7 @@ def _losses(again: np.ndarray, chance: np.ndarray, rounds: int = 20) -> np.ndarr
     """Return the probability that each message was lost, ``(N,)``.
 
     Args:
-        chance: Shape ``(N,)``: how probable a repeated value is for a message that came.
+        chance: Shape ``(N,)``: how probable this repeated value is if the message came.
     """
     share, each = 0.05, np.zeros(len(again))
     for _ in range(rounds):
@@ -459,7 +459,7 @@ class _Watched:
 
     Attributes:
         x: Shape ``(P,)``: the unknowns at the estimate.
-        delay_s: The measurements' delay there [s].
+        delay_s: The measurements' delay at the estimate [s].
         again: Shape ``(N,)``, bool: whether a measurement repeats the previous values.
     """
 
@@ -478,7 +478,7 @@ class _Watched:
         self.x = np.concatenate([x[self._moved], np.zeros(self._states * len(self._segments))])
 
     def linearise(self, unknowns: np.ndarray, about_s: float) -> DelayEvidence:
-        """Return the evidence at unknowns ``(P,)``, in the motion with a delay of the measurements [s]."""
+        """Return the evidence at unknowns ``(P,)``, with the motion simulated for a measurements' delay ``about_s``."""
         problem, table = self._problem, self._problem.table
         size, count = len(self._moved), len(self._segments)
         x, shift = self._point.copy(), np.zeros((count, 2 * len(problem.channels)))
@@ -488,7 +488,7 @@ class _Watched:
             shift = shift + unknowns[size:].reshape(count, -1)
         delays = np.linspace(0.0, table[self._late].high, max(2, round(table[self._late].high / _STEP_S) + 1))
         errors = np.stack([self._errors(x, shift, d, about_s) for d in delays], axis=-1)
-        # Differences by parameters, and by the initial state of every segment at once.
+        # Derivatives by parameters, and by the initial states of all segments at once.
         J = np.zeros((*errors.shape[:-1], len(unknowns)))
         for k, i in enumerate(self._moved):
             h = problem.config.difference * table.span[i]
@@ -506,7 +506,7 @@ class _Watched:
         return DelayEvidence(delays, errors[self._counts], J[self._counts], prior)
 
     def _errors(self, x: np.ndarray, shift: np.ndarray, delay_s: float, about_s: float) -> np.ndarray:
-        """Return the residuals of the segments with a delay of the measurements, in the motion with ``about_s``."""
+        """Return the residuals for a measurements' delay ``delay_s``, with the motion simulated for ``about_s``."""
         problem, count = self._problem, len(self._segments)
         values = {n: np.repeat(v[None], count, axis=0) for n, v in problem.table.decode(x).items()}
         states = []

@@ -1,4 +1,4 @@
-"""Jacobians by finite differences: columns that no residual shares move together, and steps correct the rest."""
+"""Jacobians by few finite differences: independent columns move together, and steps correct the matrix."""
 
 from __future__ import annotations
 
@@ -13,29 +13,30 @@ from sim2real.types import MjModel
 mj: Any = mujoco
 
 _RESPONDS = 1e-9
-"""Share of the largest derivative below which a residual is independent of a column; decoupled derivatives are exactly
-0."""
+"""A derivative below this share of the largest one counts as 0; derivatives of separate joints are exactly 0."""
 _TRUSTED = 0.3
-"""Largest error of the predicted change of the residuals, as a share of it, with which a Jacobian is corrected."""
+"""Largest relative error of a predicted change of the residuals for which the Jacobian is corrected, not computed
+again.
+"""
 Stacked = Callable[[np.ndarray], np.ndarray]
 
 
 class Groups:
     """Columns of a Jacobian that finite differences move together, as no residual depends on two of them.
 
-    Method of Curtis, Powell and Reid (J. Inst. Maths Applics 13, 1974). Joints of separate trees move independently, so
-    the motors' strengths of four legs need one rollout.
+    Method of Curtis, Powell and Reid (J. Inst. Maths Applics 13, 1974). For example, one rollout gives the derivatives
+    by the motor strengths of four legs that do not touch each other.
 
     Args:
-        apart: Whether only bodies couple joints; otherwise each column is moved alone.
-        by_tree: Whether a column belongs to all residuals of its tree, as states do that couple at other points.
+        apart: Whether joints of separate trees are independent; otherwise each column is moved alone.
+        by_tree: Whether a column counts as acting on all residuals of its tree, because it may do so at other points.
     """
 
     def __init__(self, apart: bool, by_tree: bool = False) -> None:
         self._apart, self._by_tree, self._belongs = apart, by_tree, np.zeros((0, 0), bool)
 
     def members(self, columns: Sequence[int]) -> list[list[int]]:
-        """Return the groups of some columns; each alone before the first Jacobian is known."""
+        """Return the groups of some columns; before the first Jacobian, each column is a group."""
         if not self._belongs.size:
             return [[c] for c in columns]
         groups: list[tuple[list[int], np.ndarray]] = []
@@ -50,7 +51,7 @@ class Groups:
         return [members for members, _ in groups]
 
     def spread(self, changes: np.ndarray, groups: Sequence[Sequence[int]], size: int) -> np.ndarray:
-        """Return derivatives ``(..., F, size)`` from those along groups ``(G, ..., F)``; the first ones form groups."""
+        """Return derivatives ``(..., F, size)`` from changes along groups ``(G, ..., F)``."""
         J = np.zeros((*changes.shape[1:], size))
         for change, members in zip(changes, groups, strict=True):
             for c in members:
@@ -66,13 +67,13 @@ class Groups:
             for _ in range(len(belongs)):  # columns that share a residual share all of them
                 shares = (belongs.astype(int) @ belongs.T.astype(int)) > 0
                 belongs = (shares.astype(int) @ belongs.astype(int)) > 0
-        # A column without effect at this point may have one elsewhere: it is moved alone.
+        # A column without effect at this point may have an effect elsewhere: move it alone.
         belongs[~belongs.any(axis=1)] = True
         return belongs
 
 
 def trees_are_apart(model: MjModel | None) -> bool:
-    """Return whether only bodies couple joints: there is no contact, equality or tendon."""
+    """Return whether joints of separate trees are independent: the model has no contact, equality or tendon."""
     if model is None:
         return False
     contacts = model.opt.disableflags & mj.mjtDisableBit.mjDSBL_CONTACT == 0
@@ -83,14 +84,14 @@ def trees_are_apart(model: MjModel | None) -> bool:
 class Nearby:
     """Residuals near a point, and their Jacobian, which is corrected after each step, and computed again if that fails.
 
-    Broyden's rank-one correction is exact along the last step (Math. Comp. 19, 1965).
+    The correction is Broyden's rank-one update (Math. Comp. 19, 1965).
 
     Args:
         value: Residuals ``(N,)`` at a point ``(P,)``.
         slope: Their Jacobian ``(N, P)``.
-        scale: Shape ``(P,)``: length of a step of each parameter that counts as much as one of another.
-        known: A point nearby, the residuals and the Jacobian there, which is corrected for the first point, too.
-        most: Most Jacobians that are computed; then each is corrected. Default: as many as needed.
+        scale: Shape ``(P,)``: typical step of each parameter, so that steps of different units compare.
+        known: Point, residuals and Jacobian of an earlier evaluation nearby, from which the first Jacobian is made.
+        most: Most Jacobians that are computed; later ones are only corrected. Default: as many as needed.
     """
 
     def __init__(
@@ -112,7 +113,7 @@ class Nearby:
         return self._last[1]
 
     def jacobian(self, y: np.ndarray) -> np.ndarray:
-        """Return the Jacobian at the point of a step, or at the point of the last one."""
+        """Return the Jacobian at the point of the last step."""
         if self._known is not None and np.array_equal(self._known[0], y):
             return self._known[2]
         r, J = self.residuals(y), None
@@ -123,7 +124,7 @@ class Nearby:
         return self._known[2]
 
     def renew(self, y: np.ndarray) -> bool:
-        """Compute the Jacobian at the point of the last step; return False if that was done, or may not be."""
+        """Compute the Jacobian anew at the last step; return False if it is new, or ``most`` is reached."""
         if self._computed or self._left <= 0:
             return False
         self._computed = True
@@ -144,7 +145,7 @@ def _updated(
     scale: np.ndarray | float,
     trusted: float,
 ) -> np.ndarray | None:
-    """Return the corrected Jacobian after a step; None if the old one did not predict the step."""
+    """Return the Jacobian corrected by a step; None if the old one predicted the step badly."""
     step = y - point
     expected = J @ step
     missed = r - before - expected

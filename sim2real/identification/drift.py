@@ -1,4 +1,4 @@
-"""Test whether a later log is still of the identified robot: of each parameter, and of causes that move several."""
+"""Tests whether the robot of a later log has changed since the identification: each parameter, and known causes."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -17,19 +17,20 @@ from sim2real.identification.uncertainty import loss_variance
 LEVEL = 0.05
 """False-alarm rate of the drift test, per log."""
 _SIZES = (-0.4, -0.25, -0.12, -0.05, 0.05, 0.12, 0.25, 0.4)
-"""How large changes are that are tried first, in shares of the bounds' width: of a factor of four up and down, the
-largest is 3."""
+"""Sizes of changes that are tried first, as shares of the range between the bounds."""
 _TURNS = 3
-"""Rounds of trials; each lies between the neighbours of the best size of the round before."""
+"""Rounds of trials; each round lies between the neighbours of the best size so far."""
 _FELT = 1e-3
-"""Smallest change of residuals, over all of the bounds, with which a log tests a change [variances]."""
+"""A log tests a change if it moves the residuals by at least this much between the bounds [variances]."""
 _SMALL = 0.05
-"""Factors nearer to 1 are no change, nor is a smaller share of the round-trip delay: small errors of a good model are
-significant. Of 16 unchanged hidden SO-101 three seemed to have 8 to 14 % more friction; a pendulum's delay of 54 ms,
-identified a minute before, seemed to be 0.4 ms longer."""
+"""A factor nearer to 1, or a smaller share of the round-trip delay, counts as no change: small errors of a good model
+are significant, too. Of 16 unchanged SO-101 three seemed to have 8 to 14 % more friction, and a pendulum's delay of 54
+ms seemed to be 0.4 ms longer a minute after its identification.
+"""
 _LEAST = 0.1
-"""Smallest share of the error that a change explains in an alarm. In 112 changed robots the right
-change explained 0.2 or more; in nine unchanged ones a torque limit explained 0.05 at most."""
+"""A change raises an alarm only if it explains at least this share of the error. In 112 changed robots the right change
+explained 0.2 or more; in nine unchanged robots a torque limit explained 0.05 at most.
+"""
 
 
 @dataclass(frozen=True)
@@ -46,9 +47,9 @@ class Fitted:
 
     Attributes:
         size: Distance along the change.
-        by_log: Variance of ``size`` by the log's residuals.
-        by_posterior: Variance of ``size`` by the posterior.
-        segments: Effective number of segments that inform the size.
+        by_log: Variance of ``size`` due to the log's residuals.
+        by_posterior: Variance of ``size`` due to the posterior.
+        segments: Effective number of segments that determine the size.
         loss: Loss of the log with this change, the other parameters within the posterior.
     """
 
@@ -63,8 +64,8 @@ class Fitted:
     def freedom(self) -> float:
         """Degrees of freedom of the whole variance (Satterthwaite, Biometrics Bulletin 2, 1946).
 
-        The freedom of the log's part is the effective number of informative segments minus 1: those of a pendulum that
-        is held upright do not count. The posterior's part counts as exact.
+        The log's part has as many as effective segments, minus 1: a segment in which a pendulum stands upright tells
+        nothing. The posterior's part counts as exact.
         """
         return max(self.segments - 1.0, 1.0) * ((self.by_log + self.by_posterior) / max(self.by_log, 1e-300)) ** 2
 
@@ -85,17 +86,17 @@ def drift(problem: Problem, posterior: Posterior, widening: float) -> tuple[Drif
     """Test whether a log agrees with the identified robot.
 
     Each change is fitted alone, because a short log of a policy that soon stands still cannot determine all parameters.
-    The fit is not a linear step from the estimate: with twice the friction a joint stands still that should move, and
-    derivatives at the estimate are those of another motion.
+    A linear step from the estimate would not do: with twice the friction a joint may stand still, and derivatives at
+    the estimate describe a joint that moves.
 
     Args:
         posterior: The identification; other parameters of the problem had their nominal values.
-        widening: Factor on the posterior's deviations that covers the errors of the model: they act like other
-            parameters in each motion, and a policy moves differently than an excitation.
+        widening: Factor on the posterior's standard deviations that covers errors of the model, which act like other
+            parameters in each motion.
 
     Returns:
-        The tests, and the point ``(P,)`` on the parameters' scales that explains the log best: that of the change that
-        explains most, or the estimate.
+        The tests, and the point ``(P,)`` on the parameters' scales that explains the log best: with the best change, or
+        the estimate.
 
     Raises:
         UsageError: When parameters of the posterior are not tested.
@@ -109,7 +110,7 @@ def drift(problem: Problem, posterior: Posterior, widening: float) -> tuple[Drif
     fitted = [one for one in tried if one is not None]
     if not fitted:
         raise Sim2RealError("this log determines no parameter", hint="deploy a policy that moves the robot")
-    # Compare with the log's loss without a change.
+    # Compare with the loss without a change.
     at = _finite(problem.linearise(table.within(posterior.mean)))
     now = _with_the_rest(at, root, loss_variance(problem, at))
     fitted.sort(key=lambda one: one.loss)
@@ -121,7 +122,7 @@ def drift(problem: Problem, posterior: Posterior, widening: float) -> tuple[Drif
 
 
 def _with_known(posterior: Posterior, table: ParameterTable) -> Posterior:
-    """Return the posterior of all parameters of a table; those that were not identified are nominal, without error."""
+    """Return the posterior of all parameters; those that were not identified are nominal, without error."""
     if lacking := [name for name in posterior.names if name not in table.names]:
         raise UsageError(
             f"the log is tested for {', '.join(table.names)}, but {', '.join(lacking)} were identified, too"
@@ -183,18 +184,18 @@ def _best(problem: Problem, point: Callable[[float], np.ndarray], unit: float) -
 def _beside_the_rest(at: Linearised, way: Way, root: np.ndarray, variance: float) -> tuple[float, float, float, float]:
     """Return a change's step with all other parameters free within the posterior, and its variances.
 
-    Generalised least squares gives most weight to the effects of this change alone: in slow motion a weaker motor looks
-    like a longer delay, at the start of a quick step it does not.
+    Generalised least squares gives most weight to samples that only this change explains: in slow motion a weaker motor
+    looks like a longer delay, at the start of a quick step it does not.
 
-    The log's variance is the larger of two: from each segment's residuals with their correlation in time, and from the
-    sum of squares of the segments' effects on the size (a sandwich estimate).
+    The log's variance is the larger of two estimates: from each segment's residuals with their correlation in time, and
+    from the sum of squares of the segments' effects on the size (a sandwich estimate).
 
     Args:
         root: Shape ``(P, P)``: a root of the posterior's covariance.
 
     Returns:
-        The step; the variance of the size by the log's residuals, and by the posterior; the effective number of
-        segments that inform it.
+        The step; its variances due to the log's residuals and due to the posterior; the effective number of segments
+        that determine it.
     """
     along, residuals = at.jacobian @ way.along, at.residuals.reshape(len(at.residuals), -1)
     unit = 1.0 / float(np.linalg.norm(along))
@@ -204,7 +205,7 @@ def _beside_the_rest(at: Linearised, way: Way, root: np.ndarray, variance: float
     precision = np.diag([0.0] + [1.0] * len(root))
     inverse = np.linalg.inv(np.einsum("sna,snb->ab", columns, columns) / variance + precision)
     moved = -inverse @ np.einsum("sna,sn->a", columns, residuals) / variance
-    weights = columns @ inverse[0]  # of each residual in the size
+    weights = columns @ inverse[0]  # weight of each residual in the size
     pulls = np.sum(weights * (residuals + columns @ moved), axis=1) / variance
     informed = np.sum(weights**2, axis=1)
     segments = float(informed.sum() ** 2 / np.sum(informed**2))
@@ -219,7 +220,8 @@ def _beside_the_rest(at: Linearised, way: Way, root: np.ndarray, variance: float
 def _with_the_rest(at: Linearised, root: np.ndarray, variance: float) -> float:
     """Return the loss at a point after all parameters moved within the posterior.
 
-    The right change needs small moves of the others; an imitation needs large ones, which the posterior penalises.
+    With the right change, the other parameters move little; a wrong one needs large moves, which the posterior
+    penalises.
 
     Args:
         root: Shape ``(P, P)``: a root of the posterior's covariance.
@@ -232,7 +234,7 @@ def _with_the_rest(at: Linearised, root: np.ndarray, variance: float) -> float:
 
 
 def _finite(at: Linearised) -> Linearised:
-    """Return the linearisation without segments that cannot be simulated, such as of an unstable motion."""
+    """Return the linearisation without segments whose simulation diverges."""
     whole = np.isfinite(at.residuals).all(axis=(1, 2)) & np.isfinite(at.jacobian).all(axis=(1, 2, 3))
     gone = lambda a: np.where(whole.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0)  # noqa: E731
     compared = at.compared & np.asarray(whole)[:, None]
@@ -247,7 +249,7 @@ def weigh(fitted: Sequence[Fitted], loss: float, table: ParameterTable, posterio
 
     Args:
         fitted: The fit of each change, the one that explains most first.
-        loss: Of the log, without any change.
+        loss: Loss of the log without any change.
         seconds: Length of the log [s].
     """
     rows = []
@@ -274,7 +276,7 @@ def _holm(rows: Sequence[Changed]) -> list[str]:
 
 
 def _small(name: str, table: ParameterTable, posterior: Posterior) -> float:
-    """Return the largest size, on its scale, of what counts as no change: 0 for a payload or an offset."""
+    """Return the largest size that counts as no change, on the parameter's scale: 0 for a payload or an offset."""
     column = table.columns[table.names.index(name)] if name in table.names else None
     if name == ROUND_TRIP or (column is not None and column.kind == "delay"):
         return _SMALL * _round_trip_s(table, posterior)
@@ -290,7 +292,7 @@ def _round_trip_s(table: ParameterTable, posterior: Posterior) -> float:
 def _values(
     name: str, ends: Sequence[float], table: ParameterTable, posterior: Posterior
 ) -> tuple[str, float, float, float, float]:
-    """Return the unit, the value before, and those after moving by ``ends`` on the scale; of a cause factors."""
+    """Return the unit, the value before, and the values after moves by ``ends`` on the scale; factors for a cause."""
     if name == ROUND_TRIP and name not in posterior.names:
         total = _round_trip_s(table, posterior)
         now, low, high = (float(max(total + e, 0.0)) for e in ends)

@@ -1,8 +1,8 @@
-"""The error to expect of an identification on later data, and the errors on held-out parts beside it.
+"""The error to expect of an identification on later data.
 
-The expected error of a joint is 1.25 times its worst error on the held-out parts of the recordings, each of a fit
-without that part; of ten and more, nine tenths of them count. A motion that is faster, or goes further, than the fitted
-one has larger errors: for it the expected error is wider.
+The expected error of a joint is 1.25 times its worst error on the held-out parts of the recordings, each predicted by a
+fit without that part. With ten parts or more, the worst tenth does not count. A motion that is faster, or goes further,
+than the fitted motion has larger errors: its expected error is multiplied by a factor.
 """
 
 import math
@@ -21,14 +21,15 @@ from sim2real.identification.predictions import NOISE, Position
 from sim2real.identification.segments import Extent
 
 _MARGIN = 1.25
-"""The expected error over the worst error on held-out parts."""
+"""Ratio of the expected error to the worst error on held-out parts."""
 _LEAST_PARTS = 2
-"""Fewest held-out parts from which an error of another part is expected."""
+"""Fewest held-out parts that give an expected error."""
 _MANY, _SHARE = 10, 0.9
-"""Number of errors from which on the expected error is that of nine tenths of them: the worst of 17 parts of an XL330's
-logs, one with a gain that no other log had, was 3.5 times their median."""
+"""From this number of errors on, the worst tenth does not count: the worst of 17 parts of an XL330's logs, with a gain
+that no other log had, was 3.5 times the median.
+"""
 _WIDEST = 4.0
-"""Largest factor for a motion beyond the fitted range: an error of one that differs more is not known."""
+"""Largest factor for a motion beyond the fitted range; beyond it no error is expected."""
 
 
 def wider_for(
@@ -36,8 +37,9 @@ def wider_for(
 ) -> dict[str, float]:
     """Return joint -> factor of the expected error, for data whose motion goes beyond the fitted one.
 
-    The factor is the ratio of the largest speeds, or one more than the excess of the range of any position as a share
-    of its fitted range, if that is larger. A hinge has been everywhere after a whole turn.
+    The factor is the larger of two: the ratio of the largest speeds; and 1 plus the part of any position's range
+    outside of its fitted range, as a share of the fitted range. A hinge that was fitted over a whole turn is never
+    outside.
 
     Args:
         fitted: Motion of the fitted segments; see ``segments.extents``.
@@ -64,14 +66,14 @@ def with_expected_errors(
     names: Sequence[str],
     wider: Sequence[Mapping[str, float]],
 ) -> Identification:
-    """Return an identification with the expected errors, and its errors on held-out parts beside them.
+    """Return an identification with the expected errors, and its errors on the held-out end of each log.
 
-    The end of a log is compared with what the held-out parts alone let expect. What comes after a single recording may
-    differ from its parts, in time and in temperature, so the error on it counts as a part in the expected error.
+    The end of a log is compared with the expected error of the held-out parts alone. A log that comes later may differ
+    in temperature, so the error on the end of a single recording counts as one more part in the expected error.
 
     Args:
         document: With samples, free runs, and the errors on all held-out parts.
-        names: A name for each log.
+        names: Names of the logs.
         wider: For each log the result of ``wider_for`` for its held-out part.
     """
     compared, expected, judged = list[ComparedError](), list[ExpectedError](), dict[str, ComparedError]()
@@ -88,7 +90,7 @@ def with_expected_errors(
                 size = error if math.isfinite(error) else None
                 rows.append(ComparedError(names[r], p.name, p.unit, seconds, size, free_run, expects, field=p.column))
                 later.append(error / factor if math.isfinite(error) else math.inf)
-            if not free_run and rows and len(names) == 1 and p.name in whole:  # the part of one log is all of them
+            if not free_run and rows and len(names) == 1 and p.name in whole:  # a single log has one part
                 judged[p.name] = replace(whole[p.name], expected=rows[0].expected)
             else:
                 compared += rows
@@ -97,7 +99,7 @@ def with_expected_errors(
                 runs = [part.run_s for part in parts] if free_run else []
                 seconds = max([*(row.seconds for row in rows), *runs], default=0.0)
                 expected.append(ExpectedError(p.name, p.unit, seconds, everything, free_run))
-    # The joint with the largest expected error beside its noise comes first.
+    # The joint with the largest expected error, relative to its noise, comes first.
     sigma, sizes = {p.name: p.sigma for p in positions}, dict[str, float]()
     for row in expected:
         sizes[row.joint] = max(sizes.get(row.joint, 0.0), row.error / sigma[row.joint])
@@ -109,7 +111,7 @@ def with_expected_errors(
 def expected_at(document: Identification, joint: str, error_at_horizon: float) -> float:
     """Return the expected error of a joint at a shorter horizon than the longest one.
 
-    It has the ratio to the error on held-out parts that it has at the longest horizon.
+    Its ratio to the error on held-out parts is that of the longest horizon.
 
     Args:
         error_at_horizon: The error on held-out parts at the shorter horizon.
@@ -132,9 +134,9 @@ def _expected(errors: Sequence[float], p: Position) -> float | None:
 def _on_held_out(
     document: Identification, p: Position, free_run: bool, logs: int
 ) -> Iterator[tuple[int, float, float]]:
-    """Yield number of a log, error of a position on its held-out part, and length of the prediction [s].
+    """Yield for each log its number, the error of a position on its held-out part, and the prediction's length [s].
 
-    A log in which the joint rests is left out: "no motion" would always be best.
+    A log in which the joint rests is left out: no model beats the baseline of standing still there.
     """
     columns = document.free if free_run else document.samples
     if not columns:

@@ -1,6 +1,6 @@
 """From recordings to an estimate: search on windows, descend by least squares, descend on longer segments.
 
-The loss that decides is that with initial states solved for at the point itself.
+Two points are compared by their losses after the initial states were fitted at each of them.
 """
 
 import itertools
@@ -23,34 +23,38 @@ from sim2real.identification.uncertainty import (
 )
 
 _ROUGHLY = 0.05
-"""Relative gain of the loss in a step at which a descent ends that only finds a start."""
+"""Relative gain of the loss in a step below which a descent ends that only looks for a start."""
 _COARSE = 1e-3
-"""Relative gain of the loss at which the descent from each start ends; that from the best start continues."""
+"""Relative gain of the loss below which the rough descent from each start ends."""
 ROUGH = 1e-2
-"""The same for a model that others are compared with by percents."""
+"""Relative gain of the loss below which the descent of a set of terms ends: sets are compared by percents."""
 _NEARLY, _APART = 1.5, 0.02
-"""Ratio of two losses after a rough descent up to which both starts are followed, if their ends are farther apart than
-this share of the bounds' width."""
+"""Largest ratio of two losses after a rough descent for which both starts are followed, and the smallest distance of
+their ends, as a share of the range between the bounds.
+"""
 _ROUNDS, _BACK = 4, 4
-"""Most rounds of a descent, and how often a round goes half the way back to its start."""
+"""Most rounds of a descent, and how often a failed round goes half the way back to its start."""
 _NEAR = 1e-5
-"""Relative change of the point at which a descent ends, if the differences resolve it."""
+"""Relative change of the point below which a descent ends."""
 _LEFT = 0.1
-"""A descent has converged if the next Gauss-Newton step is shorter [standard errors]."""
+"""A descent has converged if the next Gauss-Newton step is shorter than this [standard errors]."""
 _POLLED, _AWAY, _BETTER = 12, 0.5, 1e-3
-"""Points that are tried around a descent that ended with more left; how far away [standard errors]; and by which share
-their loss must be lower. Where friction sticks, the derivative at a point does not describe the points around it."""
+"""If a descent ended without convergence: number of points that are tried around its end, their distance [standard
+errors], and by which share their loss must be lower. Where friction sticks, derivatives do not describe them.
+"""
 _TRIES = 3
 _SHIFTS = (-0.5, -0.25, 0.25, 0.5)
-"""Delays at which further descents begin, from the estimate on [periods of the commands]. At 50 Hz an arm had valleys
-at 15, 21 and 28 ms: half a period alone leapt from the last to the first."""
+"""Changes of the delay with which further descents begin [periods of the commands]. At 50 Hz an arm's loss had minima
+at 15, 21 and 28 ms: half a period alone leapt from the last to the first.
+"""
 _DAMPING, _EASIER, _HARDER, _FAILED = 1e-3, 0.2, 10.0, 5
-"""First damping of a round, as a share of the curvature; its factors after a good and after a failed step; steps that
-fail in turn and end a round."""
+"""First damping of a round, as a share of the curvature; its factors after a good and after a failed step; number of
+failed steps in a row that ends a round.
+"""
 _SHORT = 8
-"""Most steps of a round whose Jacobians are limited."""
+"""Most steps of a round with a limited number of Jacobians."""
 _AS_PREDICTED = 0.25
-"""Least share of the predicted gain in a step that may end a round by its small gain."""
+"""A small gain ends a round only if the step gained at least this share of the prediction."""
 OnStep = Callable[[float, np.ndarray], None]
 """Called with the best loss and point ``(P,)`` so far, after every evaluation."""
 OnProgress = Callable[[str, float, float, np.ndarray], None]
@@ -64,8 +68,8 @@ class Refined:
 
     Attributes:
         x: Shape ``(P,)``: the best point.
-        left: Length of the next Gauss-Newton step [standard errors], of the parameter that it moves most.
-        converged: Whether the loss has a minimum there: the next step is short, or no point around is better.
+        left: Largest move of a parameter in the next Gauss-Newton step [standard errors].
+        converged: Whether the loss has a minimum at ``x``: the next step is short, or no point nearby is better.
     """
 
     x: np.ndarray
@@ -79,11 +83,11 @@ class Fit:
     """An estimate.
 
     Attributes:
-        problem: The residuals of the last refinement: on windows, or on longer segments.
+        problem: The residuals that the last refinement minimised: on windows, or on longer segments.
         x: Shape ``(P,)``: the estimate, on the parameters' scales.
         search: Result of the search; None if it was skipped.
         windows: Segments of the search, and held-out segments of the same length.
-        left: Length of the next Gauss-Newton step [standard errors], of the parameter that it moves most.
+        left: Largest move of a parameter in the next Gauss-Newton step [standard errors].
         converged: Whether the loss has a minimum at the estimate.
     """
 
@@ -126,8 +130,7 @@ def fit(
     Args:
         windows: Segments to fit, and segments to predict.
         long_spans: Segments of the configuration's ``long_s`` for the last refinement.
-        end: Shape ``(P,)``: where a fit of nearly this model ended. Only the last refinement is made, from there: one
-            on windows may leave a minimum that long segments have.
+        end: Shape ``(P,)``: the estimate of a fit of nearly this model. Only the last refinement is made, from there.
     """
     config, problem = windows.config, thinned(windows, of_recordings(windows), MOST_OF_FIT)
     # Refine from the nominal values, too, with short and with long delays: a delay may imitate an inertia.
@@ -140,7 +143,7 @@ def fit(
     longer = bool(config.long_s and long_spans)
     if end is None or not longer:
         if end is None:
-            # Where all segments take long, the best of several descents on some of them begins the descent on all.
+            # If all segments take long, first descend several times on some of them.
             few = few_of(problem)
             if few is not problem:
                 starts = _refine(few, starts, report, _COARSE).x[None]
@@ -157,9 +160,10 @@ def fit(
 
 
 def _at_other_delays(problem: Problem, found: Refined, report: OnProgress | None, takes_long: bool) -> Refined:
-    """Return the point that descents from other delays lead to if its loss is lower; else the one that was found.
+    """Return the best point of descents from other delays, or ``found`` if none is better.
 
-    They begin a quarter and half a period of the commands below and above it, and again beside each lower minimum.
+    They begin at delays a quarter and half a period of the commands shorter and longer, and again beside each better
+    end.
 
     A longer delay imitates an inertia: an arm's loss had a second minimum 7 ms above its delay of 20 ms, behind a
     ridge, with a fifth less armature.
@@ -178,12 +182,12 @@ def _at_other_delays(problem: Problem, found: Refined, report: OnProgress | None
             start[i] = column.to_scale(max(column.from_scale(x[i]) + shift * period_s, column.low))
             if start[i] == x[i]:  # there is no shorter delay
                 continue
-            # The others move as the linear model says; one that nothing determines stays.
+            # Move the other parameters as the linear model says; undetermined ones stay.
             start[others] -= np.linalg.lstsq(J[:, others], J[:, i] * (start[i] - x[i]), rcond=1e-6)[0]
             starts.append(table.within(start))
         other, least = refine(problem, np.stack(starts), lively, gain=ROUGH), problem.loss(x, lively)
-        # Fewer segments have a lower minimum at any delay. From there a descent on all may end in another valley;
-        # that of EMPS has held-out errors lower by a fifth. Where it takes long, it is made for a better delay only.
+        # A descent on all segments from the minimum of a few may end in another minimum; for EMPS its held-out errors
+        # # were lower by a fifth. If it takes long, it is made for a better delay only.
         if takes_long:
             least = refine(problem, x[None], lively, gain=ROUGH).loss
         if not other.loss < (1.0 - ROUGH) * least:
@@ -196,9 +200,9 @@ def _at_other_delays(problem: Problem, found: Refined, report: OnProgress | None
 
 
 def refit(problem: Problem, present: np.ndarray, near: np.ndarray) -> dict[str, float]:
-    """Return a rough estimate of fewer parameters; the others have their values in a model without them.
+    """Return a rough estimate of the present parameters; absent ones have their values without effect.
 
-    The descent begins at the best of the estimate of all parameters, a linear step from it, and the table's start.
+    The descent begins at the best of three points: the estimate of all parameters, a linear step from it, the start.
 
     Args:
         present: Shape ``(P,)``, bool: which free parameters are estimated.
@@ -226,7 +230,7 @@ def run_search(problem: Problem, start: np.ndarray, report: OnProgress | None = 
         start: Shape ``(P,)``: middle of the first generation.
     """
     config, table = problem.config, problem.table
-    # Few segments suffice for a search: all 23 of an arm took 2.6 times as long.
+    # Few segments suffice for a search: all 23 segments of an arm took 2.6 times as long.
     few = problem.liveliest(problem.part())
 
     def losses(candidates: np.ndarray, middle: np.ndarray) -> np.ndarray:
@@ -238,7 +242,7 @@ def run_search(problem: Problem, start: np.ndarray, report: OnProgress | None = 
 
     result = search(losses, start, table.low, table.high, config, advance)
     result = replace(result, loss=problem.loss(result.x))
-    if report:  # this loss is exact; a generation's losses linearise initial states at its middle
+    if report:  # exact, while the losses of a generation linearise initial states at its middle
         report("search", 0.0, result.loss, result.x)
     return result
 
@@ -256,9 +260,9 @@ def refine(
     Args:
         starts: Shape ``(K, P)``.
         part: Segments and parameters to fit; default: all.
-        gain: Relative gain of the loss at which the descent ends, without a test whether that is a minimum; default: at
-            a minimum, which is tested.
-        slopes: Most Jacobians of a round that are computed, not corrected, and few steps; default: as many as it needs.
+        gain: Relative gain of the loss below which the descent ends, without a test for a minimum; default: descend to
+            a minimum, and test it.
+        slopes: Most Jacobians that a round computes, in few steps; default: as many as it needs.
     """
     descent = _Descent(problem, part or problem.part(), on_step, slopes)
     starts = problem.table.within(np.asarray(starts, np.float64))
@@ -282,7 +286,7 @@ def refine(
         return Refined(x, loss, np.nan, False)
     # Descend from the best end to the minimum.
     x, loss = descent.down(x, fine)
-    # Test the end; if it is no minimum, continue from a better point nearby.
+    # Test whether the end is a minimum; if not, continue from a better point nearby.
     left, converged = remaining(problem, x, part), False
     for _ in range(_TRIES):
         if converged := left < _LEFT:
@@ -296,10 +300,9 @@ def refine(
 
 
 def remaining(problem: Problem, x: np.ndarray, part: Part | None = None) -> float:
-    """Return how much is left of a descent: the largest move of the next Gauss-Newton step [standard errors].
+    """Return the largest move of a parameter in the next Gauss-Newton step [standard errors].
 
-    A scale-free test of convergence (Bates and Watts, Technometrics 23, 1981). Where the step leaves the bounds it ends
-    there.
+    A scale-free test of convergence (Bates and Watts, Technometrics 23, 1981). The step stops at the bounds.
     """
     part, table = part or problem.part(), problem.table
     at, rest = problem.linearise(x, part), np.flatnonzero(part.present)
@@ -315,10 +318,10 @@ def remaining(problem: Problem, x: np.ndarray, part: Part | None = None) -> floa
 def bounded_step(H: np.ndarray, g: np.ndarray, x: np.ndarray, table: ParameterTable, free: np.ndarray) -> np.ndarray:
     """Return the step ``(P,)`` to the minimum of a quadratic function within the bounds.
 
-    Parameters stop at their bounds, and the others are optimised with these values.
+    A parameter that reaches its bound stays there while the others are optimised.
 
     Args:
-        H: Shape ``(P, P)``: half the second derivatives; as ``g``, half the gradient at ``x``.
+        H: Shape ``(P, P)``: half the second derivatives; ``g`` is half the gradient at ``x``.
         free: Shape ``(P,)``, bool: which parameters move.
     """
     step, moving = np.zeros(len(x)), free.copy()
@@ -336,10 +339,11 @@ def bounded_step(H: np.ndarray, g: np.ndarray, x: np.ndarray, table: ParameterTa
 
 
 def _pull(table: ParameterTable, part: Part) -> np.ndarray:
-    """Return how strongly each parameter is pulled to its nominal value, ``(P,)`` [1 / deviation].
+    """Return how strongly each parameter is pulled to its nominal value, ``(P,)`` [1 / standard deviation].
 
-    A deviation of the bounds' width is too wide to matter to a parameter that the log determines. Without it the first
-    steps carry one that hardly acts anywhere, and recordings that depend on it are predicted wrongly.
+    The pull is a prior as wide as the bounds, too weak to move a parameter that the log determines. Without it the
+    first steps would carry away a parameter that hardly acts, and recordings that depend on it would be predicted
+    wrongly.
     """
     pulled = np.array([c.kind != "delay" and c.prior is None for c in table.columns], bool)
     return np.where(pulled & part.present, 1.0 / table.span, 0.0)
@@ -355,16 +359,16 @@ class _Descent:
         self._deviation = 1.0
 
     def loss(self, x: np.ndarray) -> float:
-        """Return the loss at a point, where initial states are linearised there."""
+        """Return the loss at a point, with initial states fitted there."""
         loss = self._problem.loss(x, self._part)
         self._report(loss, x)
         return loss
 
     def down(self, x: np.ndarray, gain: float) -> tuple[np.ndarray, float]:
-        """Descend from a point until a round gains a smaller share of the loss; return where that ends, and its loss.
+        """Descend from a point until a round gains less than ``gain``; return the end and its loss.
 
-        In a round initial states keep the slopes that they have at its start. Where the loss is larger at its end once
-        they are linearised there, the round goes back towards its start.
+        In a round, the derivatives by initial states stay as they were at its start. If the end turns out worse with
+        derivatives computed there, the round goes back towards its start.
         """
         loss = self.loss(x)
         for _ in range(_ROUNDS):
@@ -384,7 +388,7 @@ class _Descent:
         return x, loss
 
     def better_nearby(self, x: np.ndarray, loss: float) -> np.ndarray | None:
-        """Return a point that is better, seen before or within about a standard error; None if none of those is."""
+        """Return a better point, seen before or within about a standard error; None if there is none."""
         if self._best[0] < (1.0 - _BETTER) * loss:
             return self._best[1]
         problem = self._problem
@@ -394,20 +398,20 @@ class _Descent:
         draws = np.random.default_rng(0).normal(size=(_POLLED, len(x)))
         points = problem.table.within(x + _AWAY * draws @ root.T)
         order = np.argsort(np.nan_to_num(problem.losses(points, x, self._part), nan=np.inf))
-        # The losses linearise initial states at the point itself; the best is computed again.
+        # These losses linearise initial states at the point ``x``; compute the best one again.
         best = points[order[0]]
         return best if self.loss(best) < (1.0 - _BETTER) * loss else None
 
     def _pulled(self, x: np.ndarray) -> float:
-        """Return what the pull to the nominal values adds to the loss."""
+        """Return the share of the loss that comes from the pull to the nominal values."""
         count = self._problem.compared(self._problem.part()).sum() * len(self._problem.fields)
         return 0.5 * float(np.sum((self._deviation * self._weight * (x - self._nominal)) ** 2) / max(count, 1))
 
     def _round(self, x: np.ndarray, gain: float) -> np.ndarray:
-        """Return where Levenberg and Marquardt's method ends from a point, within the bounds.
+        """Return the end of a Levenberg-Marquardt descent from a point, within the bounds.
 
-        Its normal equations are small: scipy's solver decomposes the whole Jacobian in each step, which took longer
-        than the rollouts of an arm.
+        It solves the small normal equations: scipy's solver decomposes the whole Jacobian in each step, which took
+        longer than the rollouts of an arm.
         """
         problem, table, config = self._problem, self._problem.table, self._problem.config
         there = problem.near(x, self._part, self._slopes)
@@ -422,11 +426,11 @@ class _Descent:
         r, g, H = normal(x)
         if not (np.isfinite(r).all() and np.isfinite(H).all()):
             return x
-        # End where no step can gain that share: steps that fail took 12 evaluations of each refit without a part.
+        # End if no step can gain that share: failing steps took 12 evaluations of each refit without a part.
         step = bounded_step(H + 1e-12 * np.diag(table.span**-2), g, x, table, free)
         if -(2.0 * g @ step + step @ H @ step) < gain * float(r @ r):
             return x
-        # Pull to the nominal values by the residuals that the next step leaves, if the slope is right.
+        # The pull is relative to the residuals that the next step should leave.
         shape, priors = (len(self._part.live), -1, len(problem.fields)), sum(c.prior is not None for c in table.columns)
         stretch = robust(there.residuals(x), config.reach)[1]
         left = r + stretch * (there.jacobian(x) @ step)

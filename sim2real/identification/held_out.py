@@ -1,7 +1,7 @@
-"""Parts of the recordings that are held out of a fit, one at a time: estimates without them, and their errors there.
+"""Holds parts of the recordings out of a fit, one at a time: estimates without a part, and their errors on that part.
 
-Around an estimate the loss of every part of the recordings is a quadratic function of the parameters, so the estimate
-without a part follows by linear algebra; a short descent ends there.
+Around an estimate, the loss of each part is approximated by a quadratic function of the parameters. So the estimate
+without a part follows by linear algebra, and a short descent corrects it.
 """
 
 from __future__ import annotations
@@ -21,14 +21,15 @@ from sim2real.identification.residuals import Linearised, Problem
 from sim2real.identification.segments import Span, on_grid
 
 MOST = 12
-"""Most fits without parts."""
+"""Largest number of fits without a part."""
 MOVES = 10.0
-"""Range of a joint's positions in motion, in deviations of a measurement."""
+"""A joint moves if the range of its positions is above this [standard deviations of a measurement]."""
 _ROUNDING_S = 1e-6
 """Largest rounding error of a time."""
 _GAIN, _SLOPES = 1e-3, 1
-"""Relative gain of the loss at which a descent without a part ends; the Jacobians of a round that it computes, as it
-begins with that of all parts."""
+"""Relative gain of the loss below which a descent without a part ends; and how many Jacobians one of its rounds
+computes, as it begins with the Jacobian of all parts.
+"""
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ class Fold:
     stretches: tuple[tuple[int, float, float], ...]
 
     def touches(self, spans: Sequence[Span], length_s: float) -> np.ndarray:
-        """Return which segments of a length share time with this part, ``(S,)``, bool."""
+        """Return which segments share time with this part, ``(S,)``, bool."""
         recording, begins = np.array([s.recording for s in spans]), np.array([s.begin_s for s in spans])
         touched = np.zeros(len(spans), bool)
         for r, begin, end in self.stretches:
@@ -74,9 +75,9 @@ class Fold:
 
 
 def shared(parts: Sequence[Fold]) -> tuple[list[Fold], np.ndarray]:
-    """Return the parts that fits are made without, at most ``MOST``, and the number of that of each part, ``(K,)``.
+    """Return at most ``MOST`` groups of parts, each held out of one fit, and the number of each part's group ``(K,)``.
 
-    Of more parts, every twelfth is in one group: the other parts of a kind, whose names are similar, stay in the fit.
+    Of more parts, every twelfth joins the same group, so that neighbours, which are similar, stay in the fit.
     """
     of = np.arange(len(parts)) % MOST
     if len(parts) <= MOST:
@@ -90,17 +91,17 @@ def folds_of(problem: Problem, blocks: int, names: Sequence[str] = (), least: in
     """Return the parts to hold out: each recording, or blocks of equal length if there are too few recordings.
 
     Args:
-        blocks: Number of blocks of all recordings together.
+        blocks: Number of blocks that all recordings together are cut into.
         names: A name for each recording; recordings of one name are one part. Default: each is a part.
 
     Raises:
-        UsageError: When there is too little to hold a part out.
+        UsageError: The recordings are too short to hold a part out.
     """
     spans = [problem.spans[i] for i in problem.train]
     recordings = sorted({s.recording for s in spans})
     name_of = {r: names[r] if names else f"recording {r + 1}" for r in recordings}
     groups = {name: [r for r in recordings if name_of[r] == name] for name in name_of.values()}
-    # Hold each recording out, or cut each into blocks of equal length.
+    # Hold out each recording, or blocks of equal length.
     if len(groups) >= max(least, 2):
         folds = [Fold(name, tuple((r, 0.0, np.inf) for r in members)) for name, members in groups.items()]
     else:
@@ -112,12 +113,12 @@ def folds_of(problem: Problem, blocks: int, names: Sequence[str] = (), least: in
             edges[1:-1] = first + on_grid(edges[1:-1] - first)
             which = f"{name_of[r]}, " if len(recordings) > 1 else ""
             folds += [Fold(f"{which}{a:.0f} to {b:.0f} s", ((r, a, b),)) for a, b in pairwise(edges)]
-    # Require that each part leaves segments to fit, and holds some.
+    # Each part must hold segments, and leave segments to fit.
     counts = [int(f.touches(spans, problem.segment_s).sum()) for f in folds]
     if not 2 <= len(folds) <= len(spans) or min(counts) == 0 or max(counts) == len(spans):
         raise UsageError(
             f"{len(spans)} segments of {problem.segment_s:g} s cannot be divided into {len(folds)} parts to hold out",
-            hint="fewer --folds, a longer recording, or shorter segments",
+            hint="set fewer --folds, shorter segments, or record for longer",
         )
     return folds
 
@@ -134,7 +135,7 @@ class Statistics:
 
     Attributes:
         x: Shape ``(P,)``: the point.
-        value: Shape ``(K,)``: sums of squares there.
+        value: Shape ``(K,)``: sums of squares at the point.
         gradient: Shape ``(K, P)``: half the gradients.
         information: Shape ``(K, P, P)``: half the second derivatives.
         prior: Shape ``(P, P)``: information of priors and bounds.
@@ -149,7 +150,7 @@ class Statistics:
     count: np.ndarray
 
     def step(self, table: ParameterTable, present: np.ndarray, held_out: np.ndarray | None = None) -> np.ndarray:
-        """Return the step to the estimate of a smaller model from all parts, or all but some, ``(P,)``.
+        """Return the step ``(P,)`` to the estimate of a smaller model, from all parts or all but the held-out ones.
 
         Args:
             present: Shape ``(T,)``, bool: the terms of the model.
@@ -186,7 +187,7 @@ def statistics(problem: Problem, at: Linearised, parts: np.ndarray) -> Statistic
 
 
 def on_held_out_parts(stats: Statistics, table: ParameterTable, present: np.ndarray) -> np.ndarray:
-    """Return the mean square on each part with that part held out of the fit, ``(K,)``, for a model with some terms."""
+    """Return the mean square on each part, ``(K,)``, with that part held out of the fit of a model with some terms."""
     scores = []
     parts = np.arange(len(stats.value))
     for k in parts:
@@ -213,11 +214,11 @@ def leave_out(estimate: Fit, parts: Sequence[Fold], settle_s: float, free_run_s:
 def refitted(problem: Problem, stats: Statistics, touched: np.ndarray, present: np.ndarray) -> list[np.ndarray]:
     """Return the estimates without each part, ``(P,)``.
 
-    No descent begins at the estimate of all parts, which includes this part: a refinement may end where it begins. It
-    begins at the linear prediction from the other parts.
+    Each descent begins at the linear prediction from the other parts, and not at the estimate of all parts, which knows
+    the held-out part: a descent may end where it begins.
 
     Args:
-        stats: Of the parts.
+        stats: Statistics of the parts.
         touched: Shape ``(K, S)``, bool: the segments of each part.
         present: Shape ``(T,)``, bool: the terms of the model.
     """
@@ -238,10 +239,10 @@ def predicted(
     settle_s: float,
     free_run_s: float,
 ) -> list[HeldOutPart]:
-    """Return the errors on each part of the estimate without its group.
+    """Return the errors on each part by the estimate without the part's group.
 
     Args:
-        stats: Of the groups of ``shared``.
+        stats: Statistics of the groups of ``shared``.
         present: Shape ``(T,)``, bool: the terms of the model.
         ends: Shape ``(G, P)``: the estimates without each group.
     """
@@ -249,7 +250,7 @@ def predicted(
     by_group = [table.decode(x, table.of_terms(present)) for x in ends]
     values = [by_group[g] for g in of]
     stacked = {n: np.stack([v[n] for v in values]) for n in values[0]}
-    # The information of a group is that of its parts, in like shares.
+    # The parts of a group share its information equally.
     own = np.einsum("kpp->kp", stats.information) / np.bincount(of)[:, None]
     total = np.maximum(own[of].sum(axis=0), 1e-300)
     shares = [dict(zip(table.names, row.tolist(), strict=True)) for row in own[of] / total]
@@ -280,7 +281,7 @@ def _free(
             begins = [s.begin_s for s in fitted if s.recording == r]
             first, last = max(begin, min(begins)), min(end, max(begins) + problem.segment_s)
             where.append((k, Span(r, first, False), last - first))
-    # Each run ends with its part; all are simulated for the length of the longest, so that one program serves them.
+    # Each run ends with its part. All are simulated for the longest length, so that one program serves them.
     lengths_s = [min(longest_s, w[2]) for w in where]
     runs = problem.recut([w[1] for w in where], max(lengths_s), ends_s=lengths_s)
     of = np.array([w[0] for w in where])
@@ -309,7 +310,7 @@ def _errors(
 
 
 def moving(problem: Problem, segments: np.ndarray) -> list[bool]:
-    """Return for each column of the residuals whether its joint moves in one of some segments.
+    """Return for each column of the residuals whether its joint moves in one of the segments.
 
     Args:
         segments: Shape ``(S,)``: numbers of the segments.

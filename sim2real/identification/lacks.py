@@ -1,6 +1,6 @@
-"""What a model lacks: a term, another direction of gravity, a stiff transmission; and the second that it misses most.
+"""What a model lacks: a term, an inclined base, an elastic transmission; and the second that it predicts worst.
 
-All of it is read from residuals that are far above the noise, and from free runs.
+Residuals far above the noise, and errors of free runs, show it.
 """
 
 import math
@@ -18,24 +18,25 @@ from sim2real.identification.residuals import Linearised, Problem
 from sim2real.identification.terms import ALIKE, MENDS
 
 _FAR = 3.0
-"""Ratio of residuals to noise above which a term is missing."""
+"""A term is missing if the residuals are above this many times the noise."""
 _FLOOR = 0.1
-"""Smallest noise, in assumed deviations of a measurement: simulated logs have none, and residuals of integrators."""
+"""Smallest noise, in assumed standard deviations of a measurement: simulated logs have only errors of integrators."""
 _ALONE = 1.5
-"""Ratio of the error in the worst second to a joint's whole error from which on a fault is in that second."""
+"""A log has a fault in its worst second if the error there is this many times the joint's error in the whole log."""
 _PROMISING = 0.95
-"""Ratio of the residuals with turned gravity to those without, by linear algebra, above which no turn is tried."""
+"""Directions of gravity are tried if, by linear algebra, a turn lowers the residuals to less than this share."""
 _GRAVITY = 10.0
-"""Ratio of residuals to noise above which other directions of gravity are tried."""
+"""Directions of gravity are tried if the residuals are above this many times the noise."""
 TILT, _TURNS = "tilt", (-1.6, -0.8, -0.3, 0.3, 0.8, 1.6, 3.1)
-"""The term of an inclined base, and the turns about each of its axes that are simulated [rad]."""
+"""The optional term of an inclined base, and the turns about each of its axes that are simulated [rad]."""
 _UNEXPLAINED = 50.0
-"""Ratio of residuals to noise above which a fit is not accepted: real motors leave 5 to 32 times their noise. A base at
-40 degrees left 120 times, and a belt that gives way 57 times, with wrong estimates in narrow intervals."""
+"""A fit is not accepted if the residuals are above this many times the noise: real motors leave 5 to 32 times. A base
+at 40 degrees left 120 times, and an elastic belt 57 times, with wrong estimates in narrow intervals.
+"""
 _RINGS = 1 / 3
-"""Share of the residuals that a resonance explains, above which a transmission gives way."""
+"""A transmission is elastic if a resonance explains at least this share of the residuals."""
 _RUNG, _LEAST_RUNG, _SLOWEST_HZ, _DAMPED = 20, 30, 2.5, 0.05
-"""Most segments in which a resonance is looked for, fewest samples of one; lowest frequency; damping ratio."""
+"""Search of a resonance: most segments, fewest samples of a segment, lowest frequency, damping ratio."""
 _GIVES_WAY = (
     "a belt, a gear or a mount gives way; the delay includes its lag, so these are no estimates. Measure at the motor, "
     "or make it stiffer"
@@ -52,7 +53,7 @@ class Lack:
 
     Attributes:
         reasons: Sentences on residuals and free runs.
-        flags: Flags with which to identify again; "": no term mends the model.
+        flags: Flags with which to identify again; "": no term improves the model enough.
         unexplained: Whether the residuals are so far above the noise that no parameter can be trusted.
     """
 
@@ -71,12 +72,12 @@ def find_lack(
 
     Args:
         document: With samples, errors on held-out parts, terms, and the worst second.
-        inclined: Called where gravity may have another direction; see ``turned_gravity``.
+        inclined: Called if gravity may have another direction; see ``turned_gravity``.
     """
     chosen, reasons, flags, unexplained = [*(document.used_terms or ())], list[str](), "", False
     worst = largest_residual(document, noises, positions)
     if worst is not None and worst[1] > _FAR:
-        # The residuals beside the noise, and the term that lowers them.
+        # Compare the residuals with the noise, and find the term that lowers them.
         position, ratio, level = worst
         unit = f" {position.unit}".rstrip()
         sentence = f"residuals of {position.name} are {ratio:.2g} times its noise of {level:.2g}{unit}"
@@ -91,7 +92,7 @@ def find_lack(
             with_it = f"--terms {','.join([*chosen, best.name])}"
             flags = with_it if gain > 1.0 - MENDS else ""
             reasons.append(f"{sentence}; {best.name} lowers the error on held-out parts by {gain:.0%}: {with_it}")
-        # A base that is mounted at an angle bends all other parameters.
+        # A base that is mounted at an angle makes all other estimates wrong.
         if ratio > _GRAVITY and not flags and (leaning := inclined()) is not None:
             share, turns = leaning
             how = " and ".join(f"{angle:+.2f} rad ({name})" for name, angle in turns.items())
@@ -115,7 +116,7 @@ def find_lack(
             size = f"is off by {with_small_unit(error, position.unit)}, {share:.1%} of its range"
         seconds = max(r.seconds for r in document.errors if r.free_run and r.joint == position.name)
         reasons.append(f"in free runs of {seconds:.3g} s on held-out parts {position.name} {size}")
-    # A fault in fitted data changes no held-out error, so it decides nothing; it may be why nothing else is explained.
+    # A fault in fitted data changes no held-out error, so it decides nothing; but it may explain large residuals.
     fault, alone = unexplained_second(document)
     if fault:
         reasons.insert(0 if alone and unexplained else len(reasons), fault)
@@ -123,7 +124,7 @@ def find_lack(
 
 
 def unexplained_second(document: Identification) -> tuple[str, bool]:
-    """Return a sentence about the worst second if the model does not explain it, and whether others are better."""
+    """Return a sentence if the model does not explain the worst second, and whether it explains the others."""
     worst = document.worst
     if worst is None or not worst.unexplained:
         return "", False
@@ -135,8 +136,8 @@ def unexplained_second(document: Identification) -> tuple[str, bool]:
 def turned_gravity(problem: Problem, values: Mapping[str, float]) -> tuple[float, dict[str, float]] | None:
     """Return by which share another direction of gravity lowers the loss, and its turns by name [rad].
 
-    None if no direction halves the error. Directions all around are simulated with the estimates and with the nominal
-    values, as estimates for a wrong direction are bent; what is better is refined.
+    None if no direction halves the error. Turns in all directions are simulated, with the estimates and with the
+    nominal values, because a wrong direction makes estimates wrong. The better one is refined.
 
     Args:
         problem: A model with the term of an inclined base.
@@ -145,7 +146,7 @@ def turned_gravity(problem: Problem, values: Mapping[str, float]) -> tuple[float
     table = problem.table
     estimate = table.encode({**{p.name: p.without for p in table}, **values})
     columns = np.array([c.term == TILT for c in table.columns])
-    # Nothing is searched for unless a small turn would help, by linear algebra, or half a turn, as of a ceiling.
+    # Search only if a small turn would help, by linear algebra, or half a turn, as of a robot at a ceiling.
     if not (_promises(problem.linearise(estimate), columns) or _half_turn_helps(problem, estimate, columns)):
         return None
     starts = []
@@ -167,7 +168,7 @@ def turned_gravity(problem: Problem, values: Mapping[str, float]) -> tuple[float
 
 
 def _promises(at: Linearised, columns: np.ndarray) -> bool:
-    """Return whether a linear step of some parameters beside all others lowers the residuals by 5 % more."""
+    """Return whether a linear step with some further parameters lowers the residuals by another 5 %."""
     J, r = at.jacobian.reshape(-1, len(at.x)), at.residuals.reshape(-1)
     left = [np.linalg.norm(r - J[:, which] @ np.linalg.lstsq(J[:, which], r, rcond=None)[0]) for which in (
         ~columns, np.ones_like(columns))]  # fmt: skip
@@ -175,7 +176,7 @@ def _promises(at: Linearised, columns: np.ndarray) -> bool:
 
 
 def _half_turn_helps(problem: Problem, x: np.ndarray, columns: np.ndarray) -> bool:
-    """Return whether half a turn about one of the axes lowers the loss; its derivative at no turn is 0."""
+    """Return whether half a turn about one of the axes lowers the loss; the derivative cannot show it."""
     turned = x + math.pi * np.eye(len(x))[columns]
     straight, *others = problem.losses(np.concatenate([x[None], problem.table.within(turned)]), x)
     return bool(np.nan_to_num(others, nan=np.inf).min() < _PROMISING**2 * straight)
@@ -184,7 +185,7 @@ def _half_turn_helps(problem: Problem, x: np.ndarray, columns: np.ndarray) -> bo
 def largest_residual(
     document: Identification, noises: Sequence[Noise], positions: Sequence[Position]
 ) -> tuple[Position, float, float] | None:
-    """Return the position whose residuals are largest beside its noise, the ratio, and the noise; None if unknown."""
+    """Return the position with the largest ratio of residuals to noise, the ratio, and the noise; None if unknown."""
     rows = []
     for p in positions:
         of = next((n for n in noises if n.field == p.column), None)
@@ -212,9 +213,10 @@ def farthest_run(document: Identification, positions: Sequence[Position]) -> tup
 def ringing(samples: Mapping[str, np.ndarray], column: str) -> tuple[float, float]:
     """Return the largest share of a position's residuals that one resonance explains, and its frequency [Hz].
 
-    A transmission that gives way moves the link beside its drive by y, with y'' + 2 d w y' + w^2 y = -q'' for the
-    predicted motion q. At each frequency y and y' are fitted beside speed, acceleration, dry friction and the free
-    oscillation of each segment. Belts explained 0.37 and more, joints of five real robots 0.27 at most.
+    An elastic transmission moves the link relative to its drive by y, with y'' + 2 d w y' + w^2 y = -q'' for the
+    predicted motion q. At each frequency the residuals are fitted by y and y', together with speed, acceleration, dry
+    friction and the free oscillation of each segment. With belts the share was 0.37 and more, on five real robots 0.27
+    at most.
     """
     from scipy.signal import cont2discrete, lfilter  # 0.2 s
 

@@ -1,4 +1,4 @@
-"""The part of a robot that identification uses: its measured fields, and a graph or a plain simulation of them."""
+"""What identification needs of a robot: its measured fields, and a graph or a simulation that predicts them."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ class Channel:
 
     Attributes:
         position: Field of the angle or position.
-        velocity: Field of its rate; None if the log has none.
-        position_sigma: Deviation of a measured position [position's unit].
-        velocity_sigma: Deviation of a measured velocity, or of one estimated from a few positions.
+        velocity: Field of its velocity; None if the log has none.
+        position_sigma: Standard deviation of a measured position [position's unit].
+        velocity_sigma: Standard deviation of a measured velocity, or of one estimated from a few positions.
         index: Entry of the fields, if they are vectors.
         label: Name for tables; default: the position's field.
-        goal: Field of a command that holds the joint's goal, in the position's unit and under the same index; None if
-            commands are no positions.
+        goal: Field of the command with the joint's goal, in the position's unit and at the same index; None if commands
+            are no positions.
     """
 
     position: str
@@ -47,7 +47,7 @@ class Channel:
 
     @property
     def fields(self) -> tuple[tuple[str, float], ...]:
-        """Field and deviation of position and velocity, in the order of residuals."""
+        """Field and standard deviation of position and velocity, in the order of residuals."""
         both = ((self.position, self.position_sigma), (self.velocity, self.velocity_sigma))
         return tuple((f, s) for f, s in both if f is not None)
 
@@ -57,12 +57,12 @@ class Channel:
 
 
 def position_of(channel: Channel) -> str:
-    """Return the name of a channel's position among the columns."""
+    """Return the name of the column with a channel's position."""
     return channel.position if channel.index is None else f"{channel.position}[{channel.index}]"
 
 
 def measured_channels(model: IdentifiableModel, episodes: Sequence[Episode]) -> IdentifiableModel:
-    """Return the model without the velocities that a log lacks, as files of other recorders do."""
+    """Return the model without velocities that the logs lack, such as logs of other recorders."""
     for episode in episodes:
         fields = episode.outputs.get(model.sensor, {})
         if any(c.velocity is not None and c.velocity not in fields for c in model.channels):
@@ -76,10 +76,10 @@ class IdentifiableModel(Protocol):
     Attributes:
         sensor: Node whose outputs are predicted.
         given: Nodes whose recorded outputs drive the model: node -> a message with field names as its leaves.
-        channels: Initial states have a position and a velocity for each.
-        ahead_s: Delay of the sensor's simulated steps behind the recorded ones [s]; ``params`` adds it to the sensor's
-            delay, so the prediction does not shift. 0 if samples fall on the world's ticks; one tick if the sensor
-            interpolates between ticks, as it reads the tick after the sample.
+        channels: The measured joints; an initial state has a position and a velocity of each.
+        ahead_s: How much later the sensor's steps are simulated than recorded [s]; ``params`` adds it to the sensor's
+            delay, so that the prediction does not shift. 0 if samples fall on the world's ticks; one tick if the sensor
+            interpolates between ticks, as it needs the tick after the sample.
     """
 
     parameters: ParameterTable
@@ -102,7 +102,7 @@ class HasLimits(Protocol):
     """A model with limits among its optional terms."""
 
     def reached(self, recordings: Sequence[Episode]) -> Mapping[str, float]:
-        """Return limit -> the largest value that recordings reach."""
+        """Return for each limit the largest value that recordings reach."""
         ...
 
 
@@ -120,24 +120,24 @@ class ChecksLogs(Protocol):
     """A model that does not describe the motion of all logs."""
 
     def check(self, episode: Episode) -> None:
-        """Raise a ``Sim2RealError`` if a log is of another motion, such as a walk beside a model of legs in a stand."""
+        """Raise a ``Sim2RealError`` if the model does not describe a log's motion, such as a walk of legs."""
         ...
 
 
 @dataclass(frozen=True)
 class PlainSimulation:
-    """A robot for a simulation in plain MuJoCo.
+    """A robot for a simulation in MuJoCo without sim2real.
 
     Attributes:
         mjcf: The model with the estimates.
         joints: Joint of each channel.
         tick_s: Time over which a command acts as its mean [s].
         begin: Measured positions and velocities ``(2 * channels,)`` -> ``qpos`` and ``qvel``.
-        law: Law of the drives, a function in ``reproduce.py``.
-        numbers: Numbers of that law.
-        integrator: MuJoCo's own, or the function ``verlet`` in ``reproduce.py``.
-        lead_s: Time that is added to the delay of commands, as MuJoCo moves joints half a step early [s].
-        velocity_lead_s: Time over which velocities are extrapolated [s].
+        law: Name of the function of ``reproduce.py`` that simulates the drives.
+        numbers: Numbers for this function.
+        integrator: MuJoCo's integrator, or the function ``verlet`` in ``reproduce.py``.
+        lead_s: Time that is added to the delay of commands, because MuJoCo moves joints half a step early [s].
+        velocity_lead_s: Time by which velocities are extrapolated [s].
     """
 
     mjcf: str
@@ -152,10 +152,10 @@ class PlainSimulation:
 
 
 def converged(spec: MjSpec) -> str:
-    """Return a model as MJCF whose solver iterates as often as in an identification on C MuJoCo.
+    """Return a model as MJCF, with the solver's iterations of an identification on C MuJoCo.
 
     Args:
-        spec: A ``mujoco.MjSpec``; it is changed.
+        spec: Changed in place.
     """
     spec.option.iterations = max(spec.option.iterations, 100)
     spec.option.ls_iterations = max(spec.option.ls_iterations, 50)

@@ -19,7 +19,7 @@ def get_leaf(tree: PyTree, path: str) -> PyTree:
     """Return the leaf at a path of mappings, dataclasses and array indices.
 
     Raises:
-        UsageError: When the path does not exist; the message lists the names that do.
+        UsageError: The path does not exist; the message lists the names that do.
     """
     for name, index in _steps(path):
         tree = _child(tree, name, path)
@@ -46,7 +46,7 @@ def _set(tree: PyTree, steps: list[tuple[str, tuple[int, ...]]], value: ArrayLik
     child = _child(tree, name, path)
     if rest:
         if index:
-            raise UsageError(f"the path {path!r} goes on behind an index: only its last step may have one")
+            raise UsageError(f"the path {path!r} goes on after an index: only the last name may have one")
         replaced = _set(child, rest, value, path)
     elif index:
         replaced = _indexed(child, index, path).at[index].set(value)

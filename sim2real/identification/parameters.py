@@ -1,4 +1,4 @@
-"""Parameters as data: names, units, bounds, priors, and the map from points on their scales to values."""
+"""Parameters of a model: names, units, bounds, priors, and the map from points of a search to values."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ from sim2real.identification.parameter_paths import set_leaf
 from sim2real.types import PyTree
 
 _BELOW, _BEYOND = 4.0, 50.0
-"""Factors of the bounds of a limit below and above the largest value that recordings reach. Inertia and friction that
-the model does not know add to a torque, and commands may ask for much more than the joint does."""
+"""Bounds of a limit, relative to the largest value that recordings reach. The true limit may be lower, as unknown
+inertia and friction distort this value, or higher than what the joint did.
+"""
 _ABOVE = 0.1
-"""Start of a search above a lower bound, as a share of the bounds' width."""
+"""How far above a lower bound of 0 a search starts, as a share of the range between the bounds."""
 
 
 @dataclass(frozen=True)
@@ -29,24 +30,25 @@ class Parameter:
     Attributes:
         name: Unique in its table.
         unit: Unit of nominal value and bounds.
-        nominal: Value of the data sheet; of a delay, the value in a model without delays.
+        nominal: Value of the data sheet; for a delay, its value in a model without delays.
         transform: Scale of the search: ``linear``, or ``log`` for positive values.
-        kind: ``dynamics``, ``delay``, or ``measurement`` (an encoder's offset, a clock's).
-        about: One line for tables and pages.
-        excite: Motion that determines it, for advice; "": no advice.
-        leaf: Place of the value in the nodes' parameters, ``node.field.field[index]``; None: the model places it.
-        prior: Mean and deviation of a normal distribution of the value; None: uniform on the scale, within the bounds.
-        free: Whether it is identified; else it stays at ``nominal``.
-        side: Of a delay: ``command`` (from the policy to the world) or ``measurement`` (from the world to the policy).
+        kind: ``dynamics``, ``delay``, or ``measurement`` (offset of an encoder or a clock).
+        about: Description in one line.
+        excite: Motion that determines it, as advice to the user; "": no advice.
+        leaf: Where the value belongs in the nodes' parameters, ``node.field.field[index]``; None: the model puts it
+            there.
+        prior: Mean and standard deviation of a normal distribution of the value; None: uniform within the bounds.
+        free: Whether it is identified; otherwise it stays at ``nominal``.
+        side: For a delay: ``command`` (from the policy to the world) or ``measurement`` (from the world to the policy).
         term: Name of the optional term of the model that it belongs to, such as ``cogging``; "": none.
         off: Its value in a model without that term; default: the nominal value.
-        vanishes: Whether 0 is possible and smaller values are not, as of a friction. On a logarithmic scale an estimate
-            only approaches 0; it counts as negligible if the model without the parameter is as good.
-        limits: Whether it limits a quantity that no motion need reach, such as a torque. If the recordings do not reach
-            the limit, it counts as not reached, and has only a lower bound.
-        begin: Start of a search; None: the nominal value; of a delay, a value within its bounds. The search of a limit
-            that no motion reaches begins below it, as the residuals depend on it there.
-        narrowed: Whether its lower bound is above the model's.
+        vanishes: Whether 0 is the smallest possible value, as for a friction. On a logarithmic scale an estimate cannot
+            reach 0; it counts as negligible if the model without the parameter is as good.
+        limits: Whether it limits a quantity, such as a torque. If the recordings do not reach the limit, the estimate
+            is only a lower bound.
+        begin: Start of a search; None: the nominal value, or for a delay a value within its bounds. The search of a
+            limit that no motion reaches begins below it, where the residuals depend on it.
+        narrowed: Whether the user raised its lower bound.
         causes: Cause that changes several parameters at once, such as a payload -> change of this one on its scale when
             the cause grows by a factor of e.
     """
@@ -99,7 +101,7 @@ class Parameter:
 
     @property
     def without(self) -> float:
-        """Its value in a model without its term."""
+        """The value in a model without the parameter's term."""
         return self.nominal if self.off is None else self.off
 
     def to_scale(self, value: float) -> float:
@@ -112,11 +114,11 @@ class Parameter:
 
 
 class ParameterTable:
-    """Parameters in a fixed order, and the map from points of the free ones, each on its own scale, to values.
+    """Parameters in a fixed order; maps points ``(P,)`` of the free ones, each on its scale, to values.
 
     Attributes:
         columns: The free parameters.
-        low: Shape ``(P,)``: lower bounds on their scales.
+        low: Shape ``(P,)``: lower bounds on the parameters' scales.
         span: Shape ``(P,)``: width of the bounds.
     """
 
@@ -192,7 +194,7 @@ class ParameterTable:
         return ParameterTable(changed.values())
 
     def with_reached(self, reached: Mapping[str, float]) -> ParameterTable:
-        """Return the table with bounds for absent limits, and starts of their search, by what recordings reach.
+        """Return the table with bounds and starts of absent limits, from what recordings reach.
 
         Args:
             reached: Limit -> the largest value that recordings reach; bounds that a user gave stay.
@@ -209,7 +211,7 @@ class ParameterTable:
         return tuple(dict.fromkeys(c.term for c in self.columns if c.term))
 
     def with_terms(self, names: Iterable[str]) -> ParameterTable:
-        """Return the table with some optional terms; parameters of other terms are fixed at their values without it.
+        """Return the table with some optional terms; parameters of absent terms are fixed at ``without``.
 
         Raises:
             UsageError: When a term is unknown.
@@ -225,7 +227,7 @@ class ParameterTable:
         return ParameterTable(rows)
 
     def of_terms(self, present: np.ndarray) -> np.ndarray:
-        """Return which entries are part of a model with some of ``terms``, ``(P,)``, bool.
+        """Return which free parameters a model with some of ``terms`` has, ``(P,)``, bool.
 
         Args:
             present: Shape ``(T,)``, bool: which terms.
@@ -250,7 +252,8 @@ class ParameterTable:
         """Return values by name at points on the parameters' scales ``(..., P)``, leaves ``(...)``.
 
         Args:
-            present: Shape ``(P,)``, bool: others have their values in a model without them; default: all are kept.
+            present: Shape ``(P,)``, bool: which parameters are kept; others get their values without effect; default:
+                all are kept.
         """
         x = np.asarray(x, np.float64)
         values = {p.name: np.full(x.shape[:-1], p.nominal) for p in self.parameters}
@@ -260,7 +263,7 @@ class ParameterTable:
         return values
 
     def placed(self, params: Mapping[str, PyTree], values: Mapping[str, ArrayLike]) -> dict[str, PyTree]:
-        """Return nodes' parameters with each value at its parameter's ``leaf``."""
+        """Return the nodes' parameters with each value at its ``leaf``."""
         tree: dict[str, PyTree] = dict(params)
         for p in self.parameters:
             if p.leaf is not None:
@@ -268,7 +271,7 @@ class ParameterTable:
         return tree
 
     def encode(self, values: Mapping[str, ArrayLike]) -> np.ndarray:
-        """Return the point ``(P,)`` on the parameters' scales of values by name, within the bounds."""
+        """Return values by name as a point ``(P,)`` on the parameters' scales, within the bounds."""
         at = [float(np.squeeze(values[p.name])) for p in self.columns]
         inside = [p.to_scale(min(max(v, p.low), p.high)) for v, p in zip(at, self.columns, strict=True)]
         return self.within(np.array(inside))
@@ -283,7 +286,7 @@ class ParameterTable:
         Args:
             x: Shape ``(P,)``: the estimate, on the parameters' scales.
             covariance: Shape ``(P, P)``, on the parameters' scales.
-            widening: Factor on the deviations with which draws cover the errors of the model.
+            widening: Factor on the standard deviations, so that draws cover the errors of the model.
         """
         transform: tuple[Transform, ...] = tuple(c.transform for c in self.columns)
         return Posterior(self.names, transform, np.asarray(x), covariance, self.low, self.high, widening)
@@ -291,7 +294,7 @@ class ParameterTable:
     def start(self, share: float = 0.25) -> np.ndarray:
         """Return the start of a fit, ``(P,)``: each parameter at its ``begin``, delays at a share of their interval.
 
-        A friction of 0 begins above it: a joint that never sticks does not show how it would.
+        A friction begins above 0: at 0 a joint never sticks, and the derivative by friction is wrong.
         """
         at = lambda p, share: p.low + share * (p.high - p.low)  # noqa: E731
         begins = {p.name: p.nominal if p.begin is None else p.begin for p in self.parameters}
@@ -303,7 +306,7 @@ class ParameterTable:
         return self.encode(first)
 
     def starts(self) -> np.ndarray:
-        """Return starts of a descent without a search, ``(K, P)``: with short delays, and with long ones."""
+        """Return starts of a descent, ``(K, P)``: with short delays, and with long ones."""
         delayed = any(c.kind == "delay" and c.begin is None for c in self.columns)
         return np.stack([self.start(share) for share in ((0.25, 0.75) if delayed else (0.25,))])
 
@@ -312,7 +315,7 @@ class ParameterTable:
         return self.encode({p.name: p.nominal for p in self.parameters})
 
     def prior_residuals(self, x: np.ndarray) -> np.ndarray:
-        """Return the residuals of the priors at ``x (P,)``, ``(Q,)``: distances from the mean in deviations."""
+        """Return the priors' residuals ``(Q,)`` at ``x (P,)``: distances from the mean, in standard deviations."""
         pulls = [(i, c, *c.prior) for i, c in enumerate(self.columns) if c.prior is not None]
         return np.array([(c.from_scale(x[i]) - mean) / deviation for i, c, mean, deviation in pulls])
 

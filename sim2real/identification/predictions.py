@@ -1,4 +1,4 @@
-"""Predictions of a model, their errors over horizons, and baselines without a model beside them."""
+"""Predictions of a model, their errors up to a horizon, and baselines such as standing still."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,9 +23,9 @@ from sim2real.identification.residuals import Problem
 from sim2real.log.schema import unit_of
 
 _BETTER = 0.95
-"""Largest ratio of the error to that of a baseline with which a model is better."""
+"""A model is better than a baseline if its error is below this share of the baseline's error."""
 NOISE = 2.0
-"""Errors below this many deviations of the measurement count as noise."""
+"""Errors below this many standard deviations of the measurement count as noise."""
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,9 @@ class Position:
     """A measured position that is judged.
 
     Attributes:
-        column: Its name in tables of errors, ``position[1]``.
-        name: Its name for people.
-        sigma: Deviation of a measurement.
+        column: Name of its column, such as ``position[1]``.
+        name: Name that users see, such as ``elbow``.
+        sigma: Standard deviation of a measurement.
     """
 
     column: str
@@ -55,7 +55,7 @@ def positions(model: IdentifiableModel, units: Mapping[str, str]) -> list[Positi
     """
     names = [c.name for c in model.channels]
     if twice := sorted({n for n in names if names.count(n) > 1}):
-        raise UsageError(f"two measured joints are called {twice[0]!r}", hint="give each channel a label of its own")
+        raise UsageError(f"two measured joints are called {twice[0]!r}", hint="give each channel another label")
     return [Position(position_of(c), c.name, unit_of(position_of(c), units), c.position_sigma) for c in model.channels]
 
 
@@ -70,13 +70,13 @@ def samples(
 
     Returns:
         Columns ``(N,)``: ``t`` and ``into`` [s], ``segment``, ``recording``, ``held_out``; for each field of a channel
-        the measurement ``FIELD_measured`` and each prediction ``FIELD_MODEL``. If commands are positions, the goal of
-        the joint is in the column of the baseline ``goal``.
+        the measurement ``FIELD_measured`` and each prediction ``FIELD_MODEL``. If commands are positions, the joint's
+        goal is the prediction of the baseline ``goal``.
     """
     held_out = ~np.isin(np.arange(problem.segments), problem.train) if held_out is None else held_out
     every, fit_s = np.arange(problem.segments), np.where(held_out, settle_s, problem.segment_s)
     columns: dict[str, np.ndarray] = {}
-    # Simulate the segments with each model; the first one fixes the columns of all.
+    # Simulate the segments with each model.
     for name, values in models.items():
         rows = {n: np.broadcast_to(v, (problem.segments, *np.shape(v))) for n, v in values.items()}
         residuals, ts = problem.predict(rows, every, fit_s), problem.ts
@@ -134,10 +134,10 @@ def errors(
     settle_s: float,
     horizon_s: float,
 ) -> list[ComparedError]:
-    """Return the errors of each position up to a horizon on held-out segments, beside those of baselines.
+    """Return the errors of each position up to a horizon on held-out segments, of a model and of baselines.
 
     The first model is judged; the others are baselines. A further baseline keeps the last measurement; if commands are
-    positions, another one is the goal itself. A position without data has no row.
+    positions, the goal itself is another baseline. A position without data has no row.
 
     Args:
         columns: Result of ``samples``.
@@ -155,19 +155,19 @@ def errors(
 
 
 def ranked(found: Mapping[Position, Mapping[str, float]], horizon_s: float) -> list[ComparedError]:
-    """Return errors by model beside each other, the worst position first; the first model is judged.
+    """Return a row for each position, with the errors of all models; the first model is judged.
 
-    First come positions for which a baseline is as good, then those with the largest error beside the best baseline.
-    Errors below the noise of the measurement count as the noise.
+    First come positions for which a baseline is as good, then the others by the ratio of error to best baseline. Errors
+    below the noise of the measurement count as the noise.
     """
     rows = []
     for p, errors_ in found.items():
-        # A prediction that diverged to NaN is infinitely wrong.
+        # A prediction that diverged to NaN has an infinite error.
         finite = {m: e if math.isfinite(e) else math.inf for m, e in errors_.items()}
         error, noise = finite.pop(next(iter(finite))), NOISE * p.sigma
         best = min(finite.values(), default=math.inf)
         excess = max(error, noise) / max(best, noise) if math.isfinite(best) else 0.0
-        # The model without delays decides nothing: if it is as good, the data needs no delays.
+        # The model without delays is no baseline here: if it is as good, the data needs no delays.
         others = {m: e for m, e in finite.items() if m != WITHOUT_DELAYS}
         as_good = () if error <= noise else tuple(m for m, e in others.items() if error > _BETTER * e)
         size, *sizes = (e if math.isfinite(e) else None for e in (error, *finite.values()))
@@ -184,9 +184,9 @@ def _baselines(columns: Mapping[str, np.ndarray]) -> list[str]:
 
 
 def _predicted(columns: Mapping[str, np.ndarray], field: str, model: str, ahead: np.ndarray) -> np.ndarray | None:
-    """Return a model's prediction ``(N,)``; None without a prediction of the field.
+    """Return a model's prediction ``(N,)``; None if it does not predict the field.
 
-    Standing still keeps the last measurement before the horizon.
+    Standing still predicts the last measurement before the horizon.
     """
     if model != STANDING_STILL:
         return columns.get(f"{field}_{model}")
@@ -234,11 +234,11 @@ def replays(problem: Problem, values: Mapping[str, ArrayLike], settle_s: float, 
 def worst_second(
     samples: Mapping[str, np.ndarray], positions: Sequence[Position], settle_s: float, logs: Sequence[str]
 ) -> tuple[WorstSecond, np.ndarray] | None:
-    """Return the worst second of all joints, logs and segments, and a mask ``(N,)`` of its samples; None without any.
+    """Return the worst second of all joints, logs and segments, and a mask ``(N,)`` of its samples, or None.
 
-    The second with the largest error beyond the noise, as a share of the joint's motion, is the worst: so a joint that
-    moves little, and a joint that moves much, can both be it. If all errors are noise, it is the second with the
-    largest error in deviations of a measurement.
+    It has the largest error beyond the noise, as a share of the joint's motion, so that joints that move little and
+    joints that move much compare. If all errors are noise, it has the largest error in standard deviations of a
+    measurement.
 
     Args:
         samples: Result of ``samples``.
@@ -256,7 +256,7 @@ def worst_second(
         for rows in segments:
             recording = int(samples["recording"][rows[0]])
             begin_s, end_s, error = worst_window(samples["t"][rows], squares[rows])
-            # A joint that does not move is compared with its noise.
+            # The error of a joint that does not move is compared with its noise.
             still = max(motion[recording], NOISE * p.sigma)
             score = (max(error - NOISE * p.sigma, 0.0) / still, error / p.sigma)
             if best is None or score > best[0]:
@@ -268,7 +268,7 @@ def worst_second(
 
 
 def _segments(samples: Mapping[str, np.ndarray], settle_s: float) -> Iterator[np.ndarray]:
-    """Yield the rows of each segment that count."""
+    """Yield the rows of each segment, without its first ``settle_s`` if it is held out."""
     counts = ~samples["held_out"].astype(bool) | (samples["into"] > settle_s)
     for segment in np.unique(samples["segment"][counts]):
         yield np.flatnonzero(counts & (samples["segment"] == segment))

@@ -29,22 +29,23 @@ from sim2real.identification.rollouts import Engine, Rollouts, choose_engine
 from sim2real.identification.segments import Data, Span, cut, data_of, padded, rounded
 
 _STATE_STEPS = 2
-"""Gauss-Newton steps of an initial state. With one, the loss of a pendulum's log jumped by 3 % where the delays changed
-by 0.3 ms, with two by 0.2 %."""
+"""Gauss-Newton steps of an initial state. When delays changed by 0.3 ms, the loss of a pendulum's log jumped by 3 %
+with one step, and by 0.2 % with two.
+"""
 _STATE_DIFFERENCE = 0.03
-"""Step of finite differences by an initial state, in its prior deviation."""
+"""Step of finite differences by an initial state, in standard deviations of its prior."""
 _CACHED = 3
-"""Cached points: a descent evaluates its end, then begins its next round there."""
+"""Number of cached points: a descent evaluates its end, and its next round begins there."""
 _SEARCHED = 8
-"""Fewest segments that a search simulates; at least two for each channel."""
+"""Fewest segments that a search simulates; it also takes at least two for each channel."""
 MOST_OF_FIT = 4e7
-"""Steps of single joints in a Jacobian from which a fit takes fewer segments: about 30 s on two cores."""
+"""If a Jacobian takes more steps of single joints, a fit uses fewer segments: about 30 s on two cores."""
 MOST_OF_SETS = 8e6
-"""The same for the first of two descents, for baselines and for sets of terms that are compared: about 4 s."""
+"""The same for a first descent, for baselines, and for sets of terms that are compared: about 4 s."""
 _BESIDE = 4
-"""Joints whose steps take as long as what a step of a model takes beside its joints."""
+"""The time of a model's step that does not depend on the number of joints, as a number of joints."""
 _FEWEST = 2
-"""Fewest segments of a channel that are live."""
+"""Fewest simulated segments of each channel."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +53,8 @@ class Part:
     """The segments that are fitted, and the parameters.
 
     Attributes:
-        live: Shape ``(S,)``, bool: which of the problem's fitted segments.
-        present: Shape ``(P,)``, bool: which parameters; others have their values in a model without them.
+        live: Shape ``(S,)``, bool: which of the problem's fitted segments are simulated and compared.
+        present: Shape ``(P,)``, bool: which parameters are fitted; others have their values without effect.
     """
 
     live: np.ndarray
@@ -61,7 +62,7 @@ class Part:
 
     @property
     def key(self) -> bytes:
-        """What tells it from other parts of the problem."""
+        """Bytes that identify this part in a cache."""
         return self.live.tobytes() + self.present.tobytes()
 
 
@@ -70,13 +71,13 @@ class Linearised:
     """Residuals and their Jacobian at a point.
 
     Attributes:
-        residuals: Shape ``(S, K, F)``, with the robust loss: their half square is the loss.
+        residuals: Shape ``(S, K, F)``: half their square is the robust loss.
         jacobian: Shape ``(S, K, F, P)``: d residual / d x.
-        prior: Shape ``(P, P)``: precision that priors and bounds add; the bounds' is that of a uniform distribution.
+        prior: Shape ``(P, P)``: precision that priors and bounds add; bounds count as a uniform distribution.
         x: Shape ``(P,)``: the point, on the parameters' scales.
         raw: Shape ``(S, K, F)``: the residuals without the robust loss.
-        compared: Shape ``(S, K)``, bool: where a measurement was compared, as an exact residual is 0, too; default: in
-            all places.
+        compared: Shape ``(S, K)``, bool: where a measurement was compared; a residual of 0 may also be exact. Default:
+            everywhere.
         loss: Half the mean square of the residuals, plus the priors.
     """
 
@@ -108,9 +109,9 @@ class _States(NamedTuple):
     """Initial states of segments; leaves ``(R, ...)``.
 
     Attributes:
-        shift: Shape ``(R, n)``: distance from the estimate from the log, in deviations of the prior.
+        shift: Shape ``(R, n)``: distance from the state that the log shows, in standard deviations of the prior.
         slope: Shape ``(R, n, K, F)``: d residual / d shift.
-        residuals: Shape ``(R, K, F)``: the residuals there.
+        residuals: Shape ``(R, K, F)``: the residuals at these states.
     """
 
     shift: np.ndarray
@@ -131,12 +132,12 @@ class Problem:
         train: Numbers of the fitted segments.
         readings: Field -> its measurements ``(E, K, ...)``.
         ts: Shape ``(E, K)``: time of each measurement [s from the segment's start]; -1 without a comparison.
-        precision: Relative change of the loss below which the noise of finite differences dominates: a round keeps the
-            slopes of initial states, so near the minimum its slope differs from the loss's.
+        precision: Relative change of the loss below which finite differences are noise: a round keeps the derivatives
+            by initial states, so near the minimum its gradient differs from that of the loss.
 
     Raises:
-        Sim2RealError: When a log lacks a node or a field, or holds NaN.
-        UsageError: When a segment holds too few measurements.
+        Sim2RealError: A log lacks a node or a field, or holds NaN.
+        UsageError: A segment has no measurement to compare with.
     """
 
     def __init__(
@@ -183,8 +184,8 @@ class Problem:
         self.readings, self.ts = cuts.measured, np.where(cuts.ts >= from_s, cuts.ts, -1.0)
         self._n, self._free = len(self.rollouts.prior), config.initial_state == "free"
         self.precision = 1e-4 if self._free else 1e-5
-        # Problems of one model share the groups of columns that move together. Joints of a compiled world may act on
-        # each other at other points: its groups are for steps alone.
+        # Problems of one model share the groups of columns that move together. In a compiled world any joints may
+        # # act on each other.
         apart, compiled = trees_are_apart(self.engine.model), self.engine.model is None
         self._groups: Groups = like._groups if like else Groups(apart)
         self._step_groups: Groups = like._step_groups if like else Groups(True) if compiled else self._groups
@@ -217,7 +218,7 @@ class Problem:
         return np.asarray(entry(self.readings[field]))
 
     def part(self, without: Sequence[int] | np.ndarray = (), present: np.ndarray | None = None) -> Part:
-        """Return the fitted segments but for some, and some of the parameters.
+        """Return the part with all fitted segments except some, and with the present parameters.
 
         Args:
             without: Numbers of the segments that are left out.
@@ -229,7 +230,7 @@ class Problem:
     def linearise(self, x: np.ndarray, part: Part | None = None) -> Linearised:
         """Return the residuals of the fitted segments and their derivatives at ``x (P,)``; the last points are cached.
 
-        Segments that are not live have residuals and derivatives 0, and are not compared.
+        Segments outside of the part have residuals and derivatives 0, and are not compared.
         """
         x, part = np.asarray(x, np.float64), part or self.part()
         for point, known, there, _ in self._last:
@@ -251,7 +252,7 @@ class Problem:
         return there
 
     def loss(self, x: np.ndarray, part: Part | None = None) -> float:
-        """Return the loss at ``x (P,)``, with initial states linearised there."""
+        """Return the loss at ``x (P,)``, with initial states fitted there."""
         return float(self.losses(np.asarray(x, np.float64)[None], x, part)[0])
 
     def losses(self, candidates: np.ndarray, middle: np.ndarray, part: Part | None = None) -> np.ndarray:
@@ -262,9 +263,9 @@ class Problem:
         return np.array([self._loss(r, self._prior(x), part) for r, x in rows])
 
     def near(self, x: np.ndarray, part: Part, slopes: int | None = None) -> Nearby:
-        """Return the residuals near ``x`` for a descent; initial states keep their slopes at ``x``.
+        """Return the residuals near ``x`` for a descent, without the robust loss, then the residuals of the priors.
 
-        They are without the robust loss, and those of the priors follow; their Jacobian is by one-sided differences.
+        Initial states keep their derivatives at ``x``. The Jacobian is by one-sided differences.
 
         Args:
             slopes: Most Jacobians that are computed; default: as many as the steps need.
@@ -291,10 +292,10 @@ class Problem:
     def simulated(
         self, values: Mapping[str, Any], segments: np.ndarray, fit_s: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the residuals of segments whose initial states are fitted to their first parts, and these states.
+        """Return the residuals of segments, and their initial states, which are fitted to the first ``fit_s`` of each.
 
         Args:
-            values: Parameters by name, ``(R, ...)``: each segment with its own.
+            values: Parameters by name, ``(R, ...)``: each segment has its own values.
             segments: Shape ``(R,)``: numbers of the segments.
             fit_s: Shape ``(R,)``: lengths of the first parts [s].
 
@@ -316,9 +317,9 @@ class Problem:
         return robust(raw, self.config.reach)[0]
 
     def liveliest(self, part: Part, most: int | None = None) -> Part:
-        """Return the segments in which the channels move most, of each channel in turn.
+        """Return the segments with most motion: the best of each channel, then the second best of each, and so on.
 
-        If recordings are few, one segment of each is among them.
+        If recordings are few, each has a segment among them.
 
         Args:
             most: Number of segments; default: as many as suffice for a start.
@@ -355,7 +356,7 @@ class Problem:
         return self.config.difference * self.table.span
 
     def _moved(self, x: np.ndarray, groups: Sequence[Sequence[int]], sign: float | np.ndarray) -> np.ndarray:
-        """Return points with each group of parameters moved by a step, within the bounds, ``(G, P)``."""
+        """Return points ``(G, P)``: in each, one group of parameters is moved by a step, within the bounds."""
         moved = np.repeat(x[None], len(groups), axis=0)
         to = np.clip(x + sign * self._step, self.table.low, self.table.high)
         for row, group in zip(moved, groups, strict=True):
@@ -363,7 +364,7 @@ class Problem:
         return moved
 
     def _known_nearby(self, x: np.ndarray, part: Part) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """Return the cached Jacobian next to a point that covers its segments and parameters; None without one."""
+        """Return point, residuals and Jacobian of the nearest cached point that covers the part; None without one."""
 
         def covers(known: Part) -> bool:
             return not ((part.live & ~known.live).any() or (part.present & ~known.present).any())
@@ -398,8 +399,8 @@ class Problem:
         return self._projected(self.table.decode(x, part.present), states, part)
 
     def _projected(self, values: Mapping[str, np.ndarray], states: _States | None, part: Part) -> np.ndarray:
-        """Return residuals ``(N, S, K, F)`` at the best initial states near ``states``; 0 in segments left out."""
-        # Roll out the live segments for all copies.
+        """Return residuals ``(N, S, K, F)`` at the best initial states near ``states``; 0 in other segments."""
+        # Simulate the segments of the part for all copies.
         live = np.flatnonzero(part.live)
         segments, copies = self.train[live], len(next(iter(values.values())))
         spread = {n: np.repeat(v, len(live), axis=0) for n, v in values.items()}
@@ -421,10 +422,10 @@ class Problem:
     # -- initial states
 
     def _fitted_states(self, x: np.ndarray, part: Part, fresh: bool = False) -> _States | None:
-        """Return the initial states of the live segments; None if they are not fitted.
+        """Return the initial states of the part's segments; None if initial states are not fitted.
 
         Args:
-            fresh: Whether the slopes are computed at the fitted states.
+            fresh: Whether to compute the derivatives again at the fitted states.
         """
         if not self._free:
             return None
@@ -444,19 +445,19 @@ class Problem:
     def _best_states(
         self, values: Mapping[str, np.ndarray], segments: np.ndarray, fit_s: np.ndarray, steps: int
     ) -> _States:
-        """Fit initial states by Gauss-Newton steps that share the slopes at no shift; return the best point of each.
+        """Fit initial states by Gauss-Newton steps that share the derivatives at the start; return the best states.
 
         Args:
             fit_s: Shape ``(R,)``: length of the first part of each segment, to which its state is fitted [s].
         """
-        # Linearise at the estimate from the log.
+        # Linearise at the state that the log shows.
         still = np.zeros((len(segments), self._n))
         slope, errors = self._slopes(values, segments, still)
         ts = self.ts[segments]
         counts = ((ts >= 0.0) & (ts <= fit_s[:, None]))[..., None]
         best = _States(still, slope, errors)
         least, candidate = _state_cost(best, counts), _next_shift(best, counts)
-        # Step with these slopes, and keep the best point.
+        # Step with these derivatives, and keep the best point.
         for _ in range(steps):
             here = _States(candidate, slope, self.errors(values, segments, candidate))
             cost = _state_cost(here, counts)
@@ -464,14 +465,14 @@ class Problem:
             shift = np.where(better[:, None], here.shift, best.shift)
             residuals = np.where(better[:, None, None], here.residuals, best.residuals)
             best, least = _States(shift, slope, residuals), np.where(better, cost, least)
-            # Near kinks, such as sticking friction, a full step may increase the cost: go half way back.
+            # Near kinks, such as sticking friction, a full step may raise the cost: go half way back.
             candidate = np.where(better[:, None], _next_shift(best, counts), (candidate + shift) / 2.0)
         return best
 
     def _slopes(
         self, values: Mapping[str, np.ndarray], segments: np.ndarray, shift: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return slopes ``(R, n, K, F)`` by initial states at shifts ``(R, n)``, and residuals ``(R, K, F)``."""
+        """Return derivatives ``(R, n, K, F)`` by initial states at shifts ``(R, n)``, and residuals ``(R, K, F)``."""
         groups = self._state_groups.members(range(self._n))
         member = np.array([[i in group for i in range(self._n)] for group in groups], float)
         moves = _STATE_DIFFERENCE * np.concatenate([np.zeros((1, self._n)), member, -member])
@@ -483,7 +484,7 @@ class Problem:
         return np.moveaxis(self._state_groups.spread(changes, groups, self._n), -1, 1), errors[0]
 
     def with_readings(self, readings: Mapping[str, np.ndarray]) -> Problem:
-        """Return the same segments with other measurements, ``(E, K, ...)`` of each field; both share programs."""
+        """Return the problem with other measurements: field -> ``(E, K, ...)``; both share programs."""
         other, measured = copy.copy(self), {f: np.array(rows) for f, rows in self.data.measured.items()}
         for name, rows in readings.items():
             measured[name][: rows.shape[0], : rows.shape[1]] = rows
@@ -518,7 +519,8 @@ def _next_shift(at: _States, counts: np.ndarray) -> np.ndarray:
     r = np.where(counts, at.residuals, 0.0).reshape(len(J), -1)
     H = J @ J.transpose(0, 2, 1) + np.eye(J.shape[1])
     pull = np.einsum("rnk,rk->rn", J, r) + at.shift
-    lost = ~(np.isfinite(H).all(axis=(1, 2)) & np.isfinite(pull).all(axis=1))  # what diverged stays
+    # Keep the state where the step is not finite.
+    lost = ~(np.isfinite(H).all(axis=(1, 2)) & np.isfinite(pull).all(axis=1))
     H[lost], pull[lost] = np.eye(J.shape[1]), 0.0
     return at.shift - np.linalg.solve(H, pull[..., None])[..., 0]
 
@@ -528,9 +530,9 @@ def _state_cost(at: _States, counts: np.ndarray) -> np.ndarray:
 
 
 def robust(raw: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return residuals whose half square is a robust loss of the given ones, and their derivative.
+    """Return residuals ``r`` for which ``r ** 2 / 2`` is the robust loss of ``raw``, and d r / d raw.
 
-    The loss is scipy's ``soft_l1``: squared below ``reach``, linear far above it.
+    The loss is scipy's ``soft_l1``: quadratic below ``reach``, linear far above it.
     """
     root = np.hypot(1.0, raw / reach)  # a square may overflow to infinity, which would make the residual 0
     share = np.sqrt(2.0 / (root + 1.0))
@@ -538,11 +540,11 @@ def robust(raw: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def thinned(problem: Problem, parts: np.ndarray, most: float) -> Problem:
-    """Return a problem with the segments with most motion of each part, if a Jacobian of all would take long.
+    """Return a problem with the segments of most motion in each part, if a Jacobian of all would take long.
 
     Args:
-        parts: Shape ``(K, S)``, bool: which fitted segments are in each part, which keeps one at least.
-        most: Steps of single joints in a Jacobian.
+        parts: Shape ``(K, S)``, bool: which fitted segments are in each part; each keeps at least one.
+        most: Largest number of steps of single joints in a Jacobian.
     """
     model, channels = problem.engine.model, len(problem.channels)
     if model is None:
@@ -564,5 +566,5 @@ def of_recordings(problem: Problem) -> np.ndarray:
 
 
 def few_of(problem: Problem) -> Problem:
-    """Return a problem with the segments with most motion, of whichever recording, if all would take long."""
+    """Return a problem with the segments of most motion, if a Jacobian of all would take long."""
     return thinned(problem, np.ones((1, len(problem.train)), bool), MOST_OF_SETS)

@@ -1,4 +1,4 @@
-"""Residuals of segments at any parameters and initial states, by one of two engines: C MuJoCo, or the compiled graph.
+"""Residuals of segments for parameters and initial states, simulated by C MuJoCo or by the compiled graph.
 
 ``Rollouts.errors`` is all that identification asks of an engine; everything else is numpy on the host. Its programs get
 the segments as an argument, so they depend on shapes alone, and copies are padded to few sizes: each compiles once.
@@ -27,8 +27,9 @@ from sim2real.worlds import rollouts as physics
 
 _NEEDED = ("open_loop", "fields", "start", "controls", "message")
 _ON_C, _COMPILED = (4, 24, 48, 128, 512), (32, 256, 1024)
-"""Copies in one call of a program. C: a Jacobian of 20 logs took 24 s of processor time with 128 at a time, 18 s with
-512. Compiled: each size is a program that contains the physics; 1,024 at a time take three quarters of the time."""
+"""Numbers of copies in one call of a program, by engine; each number compiles a program. With a largest number of 512 for
+128, a Jacobian of 20 logs took 18 s of processor time for 24 s; compiled, 1,024 save a quarter of the time.
+"""
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class Engine:
 
 
 def choose_engine(wanted: str, nodes: Mapping[str, BaseNode], messages: Mapping[str, PyTree]) -> Engine:
-    """Choose an engine, and take the physics out of the world if it is C.
+    """Choose an engine; for C, the physics is taken out of the world.
 
     Args:
         wanted: ``auto``, ``c`` or ``compiled``.
@@ -155,8 +156,8 @@ class Rollouts:
     """Simulates segments with the recorded commands and timing.
 
     Attributes:
-        prior: Shape ``(2 * channels,)``: deviation of an initial state from its estimate from the log. It is wide: with
-            a narrow prior the bias of that estimate would seem to separate the delays.
+        prior: Shape ``(2 * channels,)``: standard deviation of the prior of an initial state around the state that the
+            log shows. It is wide: with a narrow prior, the bias of that state would seem to separate the delays.
         fields: The columns of the residuals: field, deviation, and a function that takes the channel's entry.
         programs: The compiled programs by name; all problems of a model share them.
     """
@@ -185,13 +186,13 @@ class Rollouts:
         shift: np.ndarray,
         data: Data,
     ) -> np.ndarray:
-        """Return prediction minus measurement, in deviations of the measurement, ``(N, K, F)``; 0 where not compared.
+        """Return prediction minus measurement ``(N, K, F)``, in standard deviations; 0 where none is compared.
 
         Args:
             values: Parameters by name, ``(N, ...)``.
             segment: Shape ``(N,)``: numbers of the segments.
-            shift: Shape ``(N, 2 * channels)``: distance of the initial state from its estimate from the log, in
-                deviations of ``prior``.
+            shift: Shape ``(N, 2 * channels)``: distance of the initial state from the state that the log shows, in
+                units of ``prior``.
         """
         sizes = _ON_C if self._on_c else _COMPILED
         found = np.empty((len(segment), data.ts.shape[1], len(self.fields)))
@@ -231,11 +232,11 @@ class Rollouts:
     def _started(
         self, values: Mapping[str, Array], eps: Array, shift: Array, data: Data
     ) -> tuple[dict[str, PyTree], jax.Array]:
-        """Return the parameters, and the initial state of a segment."""
+        """Return the nodes' parameters, and the initial state of a segment."""
         return dict(values), self._estimated_start(eps, sum(values[n] for n in self._late), data) + shift
 
     def _estimated_start(self, eps: Array, delay_s: Scalar, data: Data) -> jax.Array:
-        """Return the initial state ``(2 * channels,)`` as measured around the start, samples being ``delay_s`` late."""
+        """Return the initial state ``(2 * channels,)`` from samples around the start, which are ``delay_s`` late."""
         cubic = jnp.moveaxis(data.starts[eps], -1, 0)
         if self.config.initial_state == "rest":
             return jnp.concatenate([cubic[0], jnp.zeros_like(cubic[0])], axis=-1)
@@ -254,7 +255,7 @@ class Rollouts:
         params = self.model.params(values_, start)
         if isinstance(self.model, CarriesPayload):
             params = self.model.loaded(params, first)
-        # Assume that the first recorded command held before, too.
+        # Assume that the first recorded command also held before it was recorded.
         return params, self.graph.begin(params, first, jnp.asarray(eps, jnp.int32)), tables, messages
 
     def _physics_inputs(self, values: Mapping[str, Array], eps: Array, shift: Array, data: Data) -> PhysicsInputs:

@@ -21,16 +21,19 @@ from sim2real.types import Array, PyTree
 Losses = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Candidates ``(N, P)`` and the middle of their block of generations ``(P,)`` -> losses ``(N,)``."""
 _BLOCK = 10
-"""Generations with one middle, after which the search decides whether to continue."""
+"""Number of generations in a block: initial states are linearised at its start, and its end decides whether to
+continue.
+"""
 _NARROW = 0.02
-"""Deviation of a generation's candidates at which the search ends; 1 is about a quarter of the bounds' width."""
+"""The search ends if the standard deviation of the candidates is below this; 1 is about a quarter of the bounds' width.
+"""
 _STANDSTILL = 0.01
-"""Relative improvement of the generations' median between blocks below which a search stands still."""
+"""The search ends if the median loss improves by less than this share between blocks."""
 _INFINITE = 1e9
 _DECADE = 10.0
 """Positive bounds with at least this ratio are searched on a logarithmic scale."""
 _INSIDE = 0.05
-"""The search begins at least so far from a bound, as a share of the bounds' width."""
+"""Smallest distance of the start from a bound, as a share of the bounds' width."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +88,7 @@ def search(
     def inside(z: np.ndarray) -> np.ndarray:
         return low + (high - low) / (1.0 + np.exp(-z))
 
-    # At a bound the logistic function is flat, and a search that begins there stays there.
+    # At a bound the logistic function is flat: a search that begins there would stay there.
     share = np.clip((start - low) / (high - low), _INSIDE, 1.0 - _INSIDE)
     state = jax.jit(strategy.init)(first, jnp.asarray(np.log(share / (1.0 - share)), jnp.float32), params)
     history, medians = [], []
@@ -139,7 +142,8 @@ def _strategy(config: FitConfig, size: int) -> tuple[PyTree, PyTree]:
     missing = [n for n, p in wanted.items() if p.default is p.empty and n not in arguments]
     if missing:
         raise UsageError(
-            f"the strategy {config.strategy!r} needs {', '.join(missing)}, which no search here has", hint="try CMA_ES"
+            f"the strategy {config.strategy!r} needs {', '.join(missing)}, which this search does not pass on",
+            hint="try CMA_ES",
         )
     # Shrink the deviation of strategies that do not adapt it.
     if "std_schedule" in wanted:
@@ -174,7 +178,7 @@ class Minimum(Shown):
     evaluations: int
 
     def about(self) -> dict[str, PyTree]:
-        """Return what to say about it: name -> value."""
+        """Return the loss, its start and the number of evaluations, for a report."""
         return {"loss": self.loss, "start": self.start, "evaluations": self.evaluations}
 
     def rows(self) -> ArtifactTable:
@@ -185,7 +189,7 @@ class Minimum(Shown):
 
 
 class _Scale:
-    """Between parameters by name and a point on their scales, ``(P,)``: logarithms where bounds span a decade."""
+    """Maps parameters by name to a point ``(P,)`` and back; on a logarithmic scale if bounds span a decade."""
 
     def __init__(self, parameters: Mapping[str, Any], bounds: Mapping[str, Any]) -> None:
         self._like = {n: np.asarray(v, np.float64) for n, v in parameters.items()}
@@ -218,9 +222,9 @@ def minimise(
         parameters: Name -> start, a number or an array.
         bounds: Name -> (lowest, highest), numbers or arrays. Positive bounds of a decade or more are searched on a
             logarithmic scale.
-        config: Strategy, population, generations, spread and seed of the search; a dict has the settings that
-            differ from the default.
-        compiled: False: the loss is plain Python, and is called for each candidate in turn.
+        config: Strategy, population, generations, spread and seed of the search; a dict has the settings that differ
+            from the default.
+        compiled: Whether JAX compiles the loss; otherwise it is plain Python and is called for each candidate in turn.
 
     Raises:
         UsageError: When parameters and bounds do not fit each other, or the loss is not one number.

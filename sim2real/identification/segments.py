@@ -21,13 +21,14 @@ from sim2real.types import Array, PyTree
 _LEAST_SAMPLES = 4
 """Smallest number of samples around the start of a segment."""
 GRID_S = 0.1
-"""Segments and held-out parts begin at multiples of this after the first one: a world that takes messages at its steps
-would take those of a regular log at other times in a segment that begins between two multiples."""
+"""Segments and held-out parts begin at multiples of this time after the first one [s], so that in every segment the
+messages of a regular log fall on the same ticks of a world.
+"""
 
 
 @dataclass(frozen=True)
 class Span:
-    """A part of a recording: its number, its begin [s], and whether it is part of the loss; else it is held out."""
+    """A segment: the number of its recording, its begin [s], and whether it is fitted; otherwise it is held out."""
 
     recording: int
     begin_s: float
@@ -39,11 +40,12 @@ class Segments:
     """E spans of one length, side by side.
 
     Attributes:
-        timeline: The recorded timing of sensor and given nodes, E episodes; the sensor's is ``ahead_s`` later.
+        timeline: The recorded timing of sensor and given nodes, E episodes; the sensor's steps are ``ahead_s`` later.
         messages: Node -> its recorded messages, leaves ``(E, N, ...)``.
         measured: Field -> ``(E, N, ...)``.
         ts: Shape ``(E, N)``: time of each measurement [s from the segment's start]; 0 after the last.
-        starts: Shape ``(E, channels, 4)``: a cubic in time through each channel's measurements around the start.
+        starts: Shape ``(E, channels, 4)``: coefficients of a cubic in time, fitted to each channel's measurements
+            around the start.
     """
 
     spans: tuple[Span, ...]
@@ -56,15 +58,16 @@ class Segments:
 
 
 class Data(NamedTuple):
-    """Segments as an argument of compiled programs: recordings whose counts round up alike share programs.
+    """Segments as an argument of compiled programs, padded so that recordings of similar length share programs.
 
-    E is the number of segments, K that of the sensor's steps. Both are rounded up; the padding repeats the last entry.
+    E is the number of segments, K the number of the sensor's steps. Both are rounded up; the padding repeats the last
+    entry.
 
     Attributes:
         tables: Timing of the simulated steps, from ``OpenLoopGraph.tables``.
         messages: Node -> its recorded messages, leaves ``(E, N, ...)``.
         measured: Field -> ``(E, K, ...)``: the measurement that each of the sensor's steps predicts.
-        ts: Shape ``(E, K)``: its time [s from the segment's start]; -1 without a comparison.
+        ts: Shape ``(E, K)``: time of this measurement [s from the segment's start]; -1 without a comparison.
         starts: Shape ``(E, channels, 4)``, as in ``Segments``.
         recording: Shape ``(E,)``: number of the segment's recording.
     """
@@ -131,7 +134,7 @@ def cut(
         ordered += parts_of
     if not ordered:
         raise UsageError("each segment would start in a gap of the log", hint="record again")
-    # Stack the recordings, and take the messages of each segment from its first step on.
+    # Stack the recordings, and take each segment's messages from its first step on.
     timeline = Timeline.stack(timelines)
     start = timeline.vertices[model.sensor].start / TICKS_PER_S
 
@@ -179,7 +182,7 @@ def cut_timeline(
         for (n, name), e in timeline.edges.items():
             take = slice(int(firsts[e.sender][i]), last[e.sender])
             seq_in = e.seq_in[:, take]
-            # A message that was consumed before the segment's first step is in the window of that step.
+            # A message that was consumed earlier is in the window of the segment's first step.
             inside = (seq_in >= 0) & (seq_in < last[n])
             seq_in = np.where(inside, np.maximum(seq_in - int(firsts[n][i]), 0), -1)
             edges[n, name] = Edge(e.received[:, take] - begin, seq_in, e.sender)
@@ -203,7 +206,7 @@ def require_moved(episode: Episode, name: str = "the log") -> None:
         )
     if episode.metadata.get("dry_run") is True:
         raise Sim2RealError(
-            f"{name} is of a dry run: torque was off, and none of its commands was sent",
+            f"{name} was recorded in a dry run: torque was off, and no command was sent",
             hint="record without --dry-run",
         )
 
@@ -232,14 +235,14 @@ def check_log(episode: Episode, model: IdentifiableModel) -> None:
             raise Sim2RealError(
                 f"field {field!r} of node {node!r} holds values that are no numbers, the first in step "
                 f"{int(np.argmin(finite))}",
-                hint="record again: a NaN cannot be identified from",
+                hint="record again: an identification needs finite numbers",
             )
     if isinstance(model, ChecksLogs):
         model.check(episode)
 
 
 def _rows(recorded: np.ndarray, first: int, width: int) -> np.ndarray:
-    """Return ``width`` recorded rows from ``first`` on; rows after the last repeat it."""
+    """Return ``width`` recorded rows from ``first`` on; beyond the end, the last row is repeated."""
     return recorded[np.minimum(first + np.arange(width), len(recorded) - 1)]
 
 
@@ -252,7 +255,7 @@ def _near(t: np.ndarray, begin_s: float) -> np.ndarray:
 
 
 def on_grid(after_s: np.ndarray | float, whole: Callable[[np.ndarray], np.ndarray] = np.round) -> np.ndarray:
-    """Return times as multiples of the grid: the nearest, or those below or above; rounding errors do not count."""
+    """Return times [s] rounded to the grid of segments by ``whole``, such as ``np.floor``."""
     return whole(np.round(np.asarray(after_s) / GRID_S, 5)) * GRID_S
 
 
@@ -276,7 +279,7 @@ def _local_fit(episode: Episode, model: IdentifiableModel, begin_s: float) -> np
         data = [c.of(episode.outputs[model.sensor][f][near]) / s for f, s in c.fields]
         rows = [p / s for p, (_, s) in zip((powers, slopes), c.fields, strict=False)]
         fits.append(np.linalg.lstsq(np.concatenate(rows), np.concatenate(data), rcond=None)[0])
-        # A joint that never moves starts at rest: a speed made of noise would seem to determine its friction.
+        # A joint that never moves starts at rest: a velocity estimated from noise would seem to determine its friction.
         (name, sigma), *_ = c.fields
         if np.ptp(c.of(episode.outputs[model.sensor][name])) < _RESTS * sigma:
             fits[-1] = np.array([data[0].mean() * sigma, 0.0, 0.0, 0.0])
@@ -284,9 +287,9 @@ def _local_fit(episode: Episode, model: IdentifiableModel, begin_s: float) -> np
 
 
 _RESTS = 10.0
-"""Range of the positions of a joint that never moves, in deviations of a measurement."""
+"""A joint never moves if the range of its positions is below this [standard deviations of a measurement]."""
 _RATE_S = 0.05
-"""Time over which a speed is averaged for the range of a motion [s]: noise of 1 mrad makes 28 mrad/s."""
+"""Time over which speeds are averaged for the extent of a motion [s]: noise of 1 mrad makes 28 mrad/s."""
 Extent = tuple[float, float, float]
 """Lowest and highest position, and largest speed."""
 
@@ -322,9 +325,9 @@ _EXACT = 4
 
 
 def rounded(count: int, steps: int = 4) -> int:
-    """Return a count rounded up to one of ``steps`` sizes between a power of two and the next.
+    """Return a count rounded up to one of ``steps`` sizes between a power of two and the next power.
 
-    Four steps add a quarter at most and an eighth on average; eight steps add half of that.
+    With four sizes the result is at most a quarter larger, and an eighth on average.
 
     Args:
         count: At least 1.

@@ -1,9 +1,8 @@
 """Optional terms of a model, chosen by forward selection on held-out parts.
 
-Each round fits the model with one further term, or a pair, for which linear algebra around the present model predicts
-smaller errors on held-out parts, and keeps the one whose errors fall most, until none falls by a tenth. The estimates
-without a part are linear steps for the candidates, and refits for the best of them. What a model lacks is found by one
-such round.
+Linear algebra around the present model proposes candidates: sets with one or two further terms and smaller errors on
+held-out parts. Each round fits the candidates and keeps the best, until no error falls by a tenth. The estimates
+without a part are linear steps for all candidates, and refits for the best. One such round finds what a model lacks.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -22,28 +21,27 @@ from sim2real.identification.residuals import MOST_OF_SETS, Linearised, Part, th
 from sim2real.identification.uncertainty import above_noise
 
 ALIKE = 1.1
-"""Largest ratio of two errors that count as equal."""
+"""Two errors count as equal up to this ratio."""
 _FAR = 1.5
-"""Ratio of the errors in free runs above which a further term harms."""
+"""A further term harms if the errors of free runs grow by more than this factor."""
 _LITTLE = 0.01
-"""Share of the loss below which a further term gains too little."""
+"""A further term gains too little if it lowers the loss by less than this share."""
 _PROMISING = 0.95
-"""Ratio of the error that linear algebra predicts with a further term to that without it, above which it is not
-fitted."""
+"""A further term is fitted only if linear algebra predicts an error below this share of the present one."""
 MENDS = 0.5
-"""Ratio of the errors on held-out parts from which on a model lacks a term."""
+"""A model lacks a term that lowers the errors on held-out parts to less than this share."""
 _LEVELS, _LOWER = 16, 2
-"""Levels of a limit that are simulated; the second start's number of levels below the first."""
+"""Number of levels of a limit that are simulated; how many levels below the best the second start is."""
 _DIVERGED = 1e9
-"""Residual of a simulation that diverges [deviations of a measurement]."""
+"""Residual that a diverging simulation counts as [standard deviations of a measurement]."""
 _LIMITED = 2.0
-"""Ratio of residuals to noise from which limits are tried: one that acts leaves far more, and its fit takes long."""
+"""Limits are tried if the residuals are above this many times the noise: a limit that acts leaves far more."""
 _TRIED = 3
-"""Most candidates that are fitted in a round, beside limits."""
+"""Most candidates that are fitted in a round, not counting limits."""
 _SHARES = (1.0, 0.25, 0.06)
-"""Shares of the linear step without a part that are simulated; the best is that estimate."""
+"""Shares of the linear step to the estimate without a part; the best of them is taken."""
 _INSIDE = 0.01
-"""Lowest level of a limit, as a share of its bounds' width."""
+"""Lowest simulated level of a limit, as a share of the range between its bounds."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +54,8 @@ class Trial:
         loss: Loss of the estimate.
         rows: The estimates without each part, and their errors on it.
         ahead: Shape ``(K,)``: mean square of the errors up to the horizon on each part, with that part held out.
-        free: Shape ``(K,)``: the same in free runs; zeros without free runs.
-        above: Ratio of the residuals to the noise of the sensor, which no set predicts.
+        free: Shape ``(K,)``: mean square of the errors in free runs; zeros without free runs.
+        above: Ratio of the residuals to the noise of the sensor.
     """
 
     present: np.ndarray
@@ -74,20 +72,20 @@ class Trial:
 
     @property
     def error(self) -> float:
-        """Root mean square of the errors on held-out parts [deviations of a measurement]."""
+        """Root mean square of the errors on held-out parts [standard deviations of a measurement]."""
         return float(np.sqrt(np.nan_to_num(self.ahead, nan=np.inf).mean()))
 
     @property
     def free_error(self) -> float:
-        """The same in free runs."""
+        """Root mean square of the errors in free runs [standard deviations of a measurement]."""
         return float(np.sqrt(np.nan_to_num(self.free, nan=np.inf).mean()))
 
     def is_better_than(self, other: "Trial") -> bool:
-        """Return whether the errors on held-out parts are clearly smaller, and those in free runs not far larger."""
+        """Return whether the errors on held-out parts are clearly smaller, and errors in free runs not far larger."""
         return self.error * ALIKE < other.error and not self.free_error > _FAR * other.free_error
 
     def mends(self, other: "Trial") -> bool:
-        """Return whether the errors on held-out parts, or those in free runs, are below half of another set's."""
+        """Return whether the errors on held-out parts or in free runs are below half of another set's errors."""
         halves = self.error < MENDS * other.error or self.free_error < MENDS * other.free_error
         return halves and self.error < other.error and not self.free_error > _FAR * other.free_error
 
@@ -128,11 +126,11 @@ class TermSearch:
 
     @property
     def segments(self) -> int:
-        """Number of segments that sets are fitted to: fewer than all where these would take long."""
+        """Number of segments to which sets of terms are fitted: not all, if that would take long."""
         return len(self._problem.train)
 
     def select(self) -> Selection:
-        """Return the terms without which held-out parts are predicted worse."""
+        """Return the terms that improve the prediction of held-out parts."""
         table = self._problem.table
         none = np.zeros(len(table.terms), bool)
         chosen = self._judged(self._attempt(none, [self._estimate.x, *table.starts()], np.inf))
@@ -151,7 +149,7 @@ class TermSearch:
         return Selection(chosen, tuple(trials))
 
     def further(self, x: np.ndarray, present: np.ndarray) -> Selection:
-        """Return the fits of a set of terms and of one further term each; chosen is a set that halves the errors.
+        """Return the fits of a set of terms, and with one further term each; a set that halves the errors is chosen.
 
         Args:
             x: Shape ``(P,)``: the estimate with the set.
@@ -166,11 +164,11 @@ class TermSearch:
         return self._problem.part(present=self._problem.table.of_terms(present))
 
     def _round(self, base: Trial, pairs: bool = True) -> list[Trial]:
-        """Return the fits with one further term, or two, that may help most, and with each limit that may act."""
+        """Return fits with the one or two further terms that may help most, and with each limit that may act."""
         table = self._problem.table
         at = self._problem.linearise(base.x)
         around = [statistics(self._problem, at, self._masks)]
-        # A friction that the present model does not need may be needed beside another term; near 0 it has no slope.
+        # A friction that is negligible now may be needed with another term; at 0 its derivative is 0, so start above.
         small = np.array([c.vanishes and c.transform == "log" for c in table.columns])
         small &= table.of_terms(base.present) & (base.x < table.start() - 1.0)
         if small.any():
@@ -188,9 +186,9 @@ class TermSearch:
         return trials
 
     def _limited(self, base: Trial, at: Linearised, present: np.ndarray) -> list[np.ndarray]:
-        """Return starts for a set with one more limit: the level that promises most, and a lower one; or none.
+        """Return starts of a fit with one more limit: the best level and a lower one; none if no level helps.
 
-        At each level the residuals are simulated; the other parameters follow by linear algebra.
+        At each level the residuals are simulated, and linear algebra moves the other parameters.
 
         Args:
             at: The present model, with the derivatives by its parameters.
@@ -209,11 +207,11 @@ class TermSearch:
         return [x[i] for i in (best, min(best + _LOWER, _LEVELS))]
 
     def _attempt(self, present: np.ndarray, starts: Sequence[np.ndarray], most: float, afresh: bool = False) -> Trial:
-        """Return the fit of a set of terms ``(T,)`` from the best of some starts, and its errors by linear steps.
+        """Return the fit of a set of terms ``(T,)`` from the best of some starts, with errors by linear steps.
 
         Args:
-            most: Loss of a smaller set; if the descent ends above it, it begins at the other starts, too.
-            afresh: Whether it begins at the nominal values, too: without a limit that acts, other estimates are bent.
+            most: Loss of a smaller set; if the descent ends above it, the other starts are tried, too.
+            afresh: Whether to begin at the nominal values, too: while a limit was missing, other estimates were wrong.
         """
         problem, table = self._problem, self._problem.table
         part, names = problem.part(present=table.of_terms(present)), self._names(present)
@@ -229,7 +227,7 @@ class TermSearch:
 
     def _judged(self, trial: Trial) -> Trial:
         """Return a trial whose fit ended, with its errors by refits without each part."""
-        # To the end, as each refit would have to descend that far, too.
+        # Descend to the minimum first, as otherwise each refit would have to.
         further = refine(self._problem, trial.x[None], self._part(trial.present), gain=self._problem.precision)
         return replace(self._trial(trial.present, further.x, further.loss, refit=True), present=trial.present)
 
@@ -246,11 +244,11 @@ class TermSearch:
         return Trial(present, x, loss, tuple(rows), ahead, free, above_noise(at))
 
     def _without_each(self, x: np.ndarray, stats: Statistics, present: np.ndarray) -> np.ndarray:
-        """Return the estimates without each group, ``(G, P)``: linear steps, shorter where a full one does not help."""
+        """Return the estimates without each group, ``(G, P)``: linear steps, shortened if a full step does not help."""
         problem, table, count = self._problem, self._problem.table, len(self._groups)
         steps = np.array([stats.step(table, present, np.arange(count) == g) for g in range(count)])
         points = table.within(x + np.concatenate([share * steps for share in _SHARES]))
-        # Simulate all candidates at a time, and compare each on the segments of the other groups.
+        # Simulate all candidates at once, and compare each on the segments of the other groups.
         residuals = problem.robustly(points, x, self._part(present))
         squares = np.nan_to_num(np.sum(residuals**2, axis=(2, 3)), nan=np.inf)
         best = [
@@ -263,7 +261,7 @@ class TermSearch:
         return tuple(n for n, there in zip(self._problem.table.terms, present, strict=True) if there)
 
     def _mean_square(self, errors: Mapping[str, float | None]) -> float:
-        """Return the mean square of errors in deviations of the measurement; 0 if no joint moved."""
+        """Return the mean square of the joints' errors [variances of the measurement]; 0 if no joint moved."""
         squares = [(e / self._sigma[name]) ** 2 for name, e in errors.items() if e is not None]
         return float(np.mean(squares)) if squares else 0.0
 
@@ -271,13 +269,13 @@ class TermSearch:
 def _proposed(
     around: Sequence[Statistics], table: ParameterTable, present: np.ndarray, pairs: bool
 ) -> list[np.ndarray]:
-    """Return larger sets in the order in which they are fitted, ``(T,)`` each, by their predicted errors.
+    """Return larger sets of terms, ``(T,)`` each, with the smallest predicted errors first.
 
-    The first has one further term. The others have two, if that is clearly better, or another one. Sets that promise
-    less than 5 % are left out.
+    The first has one further term. The others have two, if that is clearly better, or another one. Sets whose predicted
+    gain is below 5 % are left out.
 
     Args:
-        around: The loss around one point, or several: a set counts by the point from which it gains most.
+        around: The loss around one or several points: of these, the one from which a set gains most counts.
     """
     absent, place = np.flatnonzero(~present & ~table.of_limits()), np.arange(len(present))
 
@@ -300,9 +298,10 @@ def _proposed(
 def gains(selection: Selection, table: ParameterTable) -> tuple[Term, ...]:
     """Return all terms with their gains; those in use come first, then the others by their gain.
 
-    A gain is the difference of the errors of two sets that differ by this term. Of a term in use, the pair that is
-    closest to the chosen set counts. Of another one, only the chosen set with it: its gain beside a smaller set may be
-    that of a term that was chosen since. A term with which free runs are far worse harms, whatever it gains ahead.
+    A gain is the relative difference of the errors of two sets that differ by this term. For a term in use, the pair
+    that is closest to the chosen set counts. For another term, only the chosen set with and without it: with a smaller
+    set, the gain may belong to a term that was chosen later. A term that makes free runs far worse harms, whatever its
+    gain.
     """
     rows, chosen = [], selection.chosen
     for i, name in enumerate(table.terms):

@@ -1,7 +1,7 @@
 """How well recordings determine parameters: covariance, intervals, undetermined parameters, noise.
 
-The covariance is that of a linear model with the residuals' own variance. Two things widen it: correlation of the
-residuals in time, and the spread of the estimates without one part of the recordings each.
+The covariance is that of a linear model with the variance of the residuals. Two things widen it: correlation of the
+residuals in time, and differences between the estimates that leave out one part of the recordings each.
 """
 
 from __future__ import annotations
@@ -19,33 +19,35 @@ from sim2real.identification.residuals import Linearised, Problem, of_recordings
 from sim2real.later import special
 
 VAGUE = 0.15
-"""Standard errors above this share of the bounds' width are not determined (a uniform distribution has 0.29)."""
+"""A parameter is not determined if its standard error is above this share of the bounds' width (uniform: 0.29)."""
 AT_BOUND = 0.005
 """An estimate within this share of the bounds' width of a bound counts as at the bound."""
 OK, ABSENT, NOT_REACHED, BOUND, UNDETERMINED = "ok", "absent", "not reached", "at a bound", "not determined"
-"""Verdicts on a parameter: determined; one that may be 0, as it is small; a limit above all that was reached; ..."""
+"""States of a parameter: determined; negligible, as it may be 0; a limit that no motion reached; ..."""
 _ONE_SIDED = 1.645
 """One-sided 95 % quantile of a normal distribution."""
 _BLOCKS = 20
-"""Most parts of the recordings of which each is left out by a linear step."""
+"""Most parts of the recordings that are left out in turn, by a linear step."""
 _FEWEST = 4
-"""Fewest parts from which the spread of estimates is computed."""
+"""Fewest parts for which the spread of estimates is computed."""
 _RESOLVED = 1e-13
-"""Least eigenvalue of a precision with a diagonal of ones: smaller ones are rounding errors of doubles."""
+"""Smallest eigenvalue of a precision matrix with a diagonal of ones: smaller ones are rounding errors."""
 _ALONE = 0.5
-"""Share of the information about a parameter of one part from which the others do not show how much it differs."""
+"""If one part has this share of the information about a parameter, the other parts do not show how much it varies."""
 _BY_CHANCE = (0.2, 0.05)
-"""Intervals begin to widen where chance alone would make parts differ as much in this share of recordings, and widen
-in full in this one: a sharp limit doubled an interval, or did not, by the last digits of a fit."""
+"""Intervals begin to widen at the first probability that chance alone makes the parts differ as much, and widen in full
+at the second. With one sharp limit, the last digits of a fit decided whether an interval doubled.
+"""
 _TAKES_PART = 0.1
-"""Smallest entry with which a parameter takes part in a direction, as a share of the largest entry."""
+"""A parameter takes part in a direction if its entry is above this share of the largest entry."""
 _ORDER, _GAIN = 3, 20.0
-"""Differences of this order remove slow changes, such as the errors of a model; the variance of those of white noise of
-variance 1: 1 + 9 + 9 + 1."""
+"""Differences of this order remove slow changes, such as the errors of a model; and their variance for white noise of
+variance 1: 1 + 9 + 9 + 1.
+"""
 _FLOOR = 0.1
-"""Smallest noise, in assumed deviations of a measurement: simulated logs have none, and residuals of integrators."""
+"""Smallest noise, in assumed standard deviations of a measurement: simulated logs have only errors of integrators."""
 _MULTIPLES = 0.98
-"""Share of the differences between readings that must be multiples of a quantum."""
+"""Readings have a resolution if this share of their differences are multiples of it."""
 
 
 @dataclass(frozen=True)
@@ -57,9 +59,9 @@ class Uncertainty:
         standard_error: Shape ``(P,)``.
         low: Shape ``(P,)``: lower end of the 95 % interval, within the bounds.
         high: Shape ``(P,)``: upper end.
-        verdict: One a parameter, see ``OK``.
-        misfit: Root mean square of the residuals in deviations of the measurement, without a robust loss: 1 where the
-            model explains everything but the noise.
+        verdict: State of each parameter, see ``OK``.
+        misfit: Root mean square of the residuals, in standard deviations of the measurement and without the robust
+            loss: 1 if the model explains everything except noise.
     """
 
     scale_covariance: np.ndarray
@@ -73,10 +75,10 @@ class Uncertainty:
 def from_linearised(problem: Problem, at: Linearised) -> Uncertainty:
     """Return the uncertainty at a linearised point.
 
-    The bounds act as a weak prior, so that a direction which the log does not determine gets the width of its bounds
-    and not infinity. Residuals that are correlated in time carry less information than their number: the variance is
-    scaled by (1 + rho) / (1 - rho), rho their correlation from one sample to the next. Where the model is wrong, that
-    is still too small: standard errors then grow to what estimates without one part vary by.
+    The bounds act as a weak prior, so that an undetermined direction is as wide as its bounds, and not infinite.
+    Residuals that are correlated in time carry less information: the variance is multiplied by (1 + rho) / (1 - rho),
+    where rho is the correlation of successive residuals. If the model is wrong, that is still too small: standard
+    errors then grow to the spread of the estimates without one part each.
     """
     table, J = problem.table, at.jacobian.reshape(-1, len(at.x))
     variance = loss_variance(problem, at)
@@ -104,8 +106,9 @@ def between_parts(
 ) -> Uncertainty:
     """Return wider intervals if estimates without a part of the recordings differ more than by chance.
 
-    The standard error is that of the jackknife over parts (Efron and Stein, Annals of Statistics 9, 1981). A parameter
-    that one part determines does not show how much it would differ in others: it widens as the median parameter.
+    The standard error is that of the jackknife over parts (Efron and Stein, Annals of Statistics 9, 1981). If one part
+    alone determines a parameter, its spread is unknown: its interval widens by the median factor of the other
+    parameters.
 
     Args:
         moved: Shape ``(K, P)``: estimates without each part, on the parameters' scales.
@@ -123,7 +126,7 @@ def between_parts(
     weight = np.clip((begin - special.chdtrc(parts - 1.0, (parts - 1.0) * ratio**2)) / (begin - full), 0.0, 1.0)
     student = float(special.stdtrit(parts - 1.0, 0.975)) / 1.96
     factor = 1.0 + weight * (np.maximum(ratio * student, 1.0) - 1.0)
-    # No standard error grows beyond that of a uniform distribution within the bounds.
+    # No standard error exceeds that of a uniform distribution within the bounds.
     factor = np.minimum(factor, np.maximum(1.0, table.span / np.sqrt(12.0) / np.maximum(errors, 1e-30)))
     wider = _of_covariance(table, at.x, spread.scale_covariance * np.outer(factor, factor), at)
     kept = [
@@ -135,7 +138,7 @@ def between_parts(
 
 
 def _without_blocks(at: Linearised, variance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the estimates without each block of segments by a linear step ``(B, P)``, and the blocks' information."""
+    """Return the estimates without each block of segments ``(B, P)``, by a linear step, and the blocks' information."""
     edges = np.linspace(0, len(at.residuals), min(_BLOCKS, len(at.residuals)) + 1).astype(int)
     blocks = [at.of(np.arange(a, b)) for a, b in pairwise(edges)]
     rows = [(b.jacobian.reshape(-1, len(at.x)), b.residuals.reshape(-1)) for b in blocks]
@@ -150,9 +153,9 @@ def _without_blocks(at: Linearised, variance: float) -> tuple[np.ndarray, np.nda
 def _with_absent(spread: Uncertainty, table: ParameterTable, at: Linearised, variance: float) -> Uncertainty:
     """Return one-sided intervals of parameters that may be 0, and of limits that no motion reaches.
 
-    On a logarithmic scale 0 is infinitely far away: a friction that is absent has an interval as wide as the bounds.
-    Its effect is in proportion to its value, so a derivative by the value bounds it from above. A limit that no motion
-    reaches has no effect: every larger value is alike, and it stays nominal.
+    On a logarithmic scale 0 is infinitely far away: the interval of an absent friction would be as wide as the bounds.
+    Its effect is proportional to its value, so the derivative by the value gives an upper end. A limit that no motion
+    reaches has no effect: all larger values are equally good, and the estimate stays nominal.
     """
     J, verdicts, low, high = (
         at.jacobian.reshape(-1, len(at.x)),
@@ -177,13 +180,13 @@ def _with_absent(spread: Uncertainty, table: ParameterTable, at: Linearised, var
 
 
 def loss_variance(problem: Problem, at: Linearised) -> float:
-    """Return the variance of a residual, larger where residuals are correlated in time."""
+    """Return the variance of a residual, larger if residuals are correlated in time."""
     count, free, inflation = _freedom(problem, at)
     return float(np.sum(at.residuals**2)) / max(count - free, 1) * inflation
 
 
 def deviation(residuals: np.ndarray, compared: np.ndarray) -> float:
-    """Return the deviation of a residual ``(S, K, F)``, larger where residuals are correlated in time.
+    """Return the standard deviation of a residual ``(S, K, F)``, larger if residuals are correlated in time.
 
     Args:
         compared: Shape ``(S, K)``, bool: which residuals count.
@@ -201,8 +204,8 @@ def _freedom(problem: Problem, at: Linearised) -> tuple[int, int, float]:
 def root_of_inverse(precision: np.ndarray) -> np.ndarray:
     """Return ``R (Q, Q)`` with ``R R' = precision^-1``, for a matrix that rounding may have made indefinite.
 
-    A quantity with a million measurements and one with bounds alone differ by more than doubles resolve: a plain
-    inverse had negative variances there.
+    The entries of a well measured and of a hardly measured parameter differ by more than doubles resolve: a plain
+    inverse had negative variances.
     """
     unit = 1.0 / np.sqrt(np.diag(precision))
     values, axes = np.linalg.eigh(precision * np.outer(unit, unit))
@@ -223,7 +226,7 @@ class Determined:
 
     Attributes:
         undetermined: Groups of parameters; the data determines at most combinations of each group.
-        messages: The same in sentences.
+        messages: The same as sentences.
         standard_error_per_minute: Parameter -> expected standard error after one minute of such data.
     """
 
@@ -233,7 +236,7 @@ class Determined:
 
 
 def determined(problem: Problem, at: Linearised, without: Collection[str] = ()) -> Determined:
-    """Return which parameters the data determines at a linearised point, with the noise of the channels alone.
+    """Return which parameters the data determines at a linearised point, if the only errors are noise.
 
     Args:
         without: Names of parameters that do not count, as they may be absent.
@@ -244,12 +247,12 @@ def determined(problem: Problem, at: Linearised, without: Collection[str] = ()) 
     J[:, held] = 0.0
     information = J.T @ J
     weights, axes = np.linalg.eigh(information)
-    # Compute the standard errors to expect from one minute of such data.
+    # Compute the standard errors that one minute of such data would give.
     prior = at.prior * np.outer(table.span, table.span)
     duration_s = problem.segment_s * len(problem.train)
     slope = np.abs(table.slope(at.x)) * table.span
     minute = np.sqrt(np.diag(np.linalg.inv(information * 60.0 / duration_s + prior))) * slope
-    # Find the directions that the data leaves open, and the parameters that move together along them.
+    # Find the directions that the data does not determine, and the parameters that move together along them.
     open_axes = np.where(held[:, None], 0.0, axes)[:, weights < 1.0 / VAGUE**2]
     open_axes = open_axes[:, np.abs(open_axes).max(axis=0, initial=0.0) > 1e-9]
     groups, messages = _groups(open_axes), []
@@ -269,7 +272,7 @@ def _groups(directions: np.ndarray) -> list[list[int]]:
     """Return which parameters move together along directions ``(P, k)`` that the data does not determine."""
     if not directions.shape[1]:
         return []
-    spread = directions @ directions.T  # (P, P): the projection onto them, the same in any basis
+    spread = directions @ directions.T  # (P, P): the projection onto the directions, which no choice of basis changes
     part = np.sqrt(np.diag(spread))
     taking = part > _TAKES_PART * part.max()
     groups: list[list[int]] = []
@@ -285,9 +288,9 @@ def _groups(directions: np.ndarray) -> list[list[int]]:
 
 
 def compare_recordings(problem: Problem, at: Linearised) -> tuple[OverLogs, ...]:
-    """Return each quantity by each recording alone, by a linear step from the estimate of all, and its spread.
+    """Return for each quantity the estimates by each recording alone, and their spread.
 
-    So recordings differ by changes of the robot, and not by the optimum that a search reached.
+    Each is a linear step from the estimate of all, so that recordings do not differ by the minimum that a search found.
     """
     table, alone = problem.table, []
     for segments in of_recordings(problem):
@@ -309,20 +312,21 @@ def compare_recordings(problem: Problem, at: Linearised) -> tuple[OverLogs, ...]
 def aggregate(estimates: np.ndarray, errors: np.ndarray, name: str = "", unit: str = "") -> OverLogs:
     """Combine estimates ``(K,)`` and their standard errors ``(K,)`` by a random-effects model (DerSimonian and Laird).
 
-    The standard error of one recording excludes the differences between recordings: temperature, wear, the errors of
-    the model on other motions. The interval is the prediction interval for one further recording (Higgins, Thompson
-    and Spiegelhalter, 2009), widened by the median standard error of a recording. Training randomises within it.
+    The standard error of one recording does not include differences between recordings, due to temperature, wear, or
+    errors of the model on other motions. The interval is the prediction interval of one further recording (Higgins,
+    Thompson and Spiegelhalter, 2009), widened by the median standard error of a recording. Training randomises within
+    this interval.
     """
     x, s = np.asarray(estimates, np.float64), np.maximum(np.asarray(errors, np.float64), 1e-30)
     if len(x) < 2:
         raise UsageError(f"an aggregate needs two recordings at least, got {len(x)}")
-    # Weight each recording by its own precision, and measure how much more they differ than that explains.
+    # Weight each recording by its precision, and measure how much more they differ than these precisions explain.
     w = 1.0 / s**2
     fixed = float(np.sum(w * x) / np.sum(w))
     q = float(np.sum(w * (x - fixed) ** 2))
     surplus = float(np.sum(w) - np.sum(w**2) / np.sum(w))
     between = max(0.0, (q - (len(x) - 1)) / surplus)
-    # Weight them again with the variance between recordings added.
+    # Weight the recordings again, with the variance between them added.
     w = 1.0 / (s**2 + between)
     mean, error = float(np.sum(w * x) / np.sum(w)), float(np.sqrt(1.0 / np.sum(w)))
     reach = float(special.stdtrit(max(len(x) - 2, 1), 0.975)) * np.sqrt(between + error**2 + float(np.median(s**2)))
@@ -330,7 +334,7 @@ def aggregate(estimates: np.ndarray, errors: np.ndarray, name: str = "", unit: s
 
 
 def noises(samples: Mapping[str, np.ndarray], units: Mapping[str, str]) -> tuple[Noise, ...]:
-    """Return how each measured quantity scatters around the identified model.
+    """Return the noise of each measured quantity around the identified model.
 
     Third differences of the residuals separate white noise from slow errors of the model.
 
@@ -341,7 +345,7 @@ def noises(samples: Mapping[str, np.ndarray], units: Mapping[str, str]) -> tuple
     rows = []
     for name in (n.removesuffix("_measured") for n in samples if n.endswith("_measured")):
         measured = samples[f"{name}_measured"]
-        # Split the residuals by segment, without values that diverged.
+        # Split the residuals by segment, without diverged values.
         parts = [
             (measured - samples[f"{name}_identified"])[rows]
             for rows in (samples["segment"] == s for s in np.unique(samples["segment"]))
@@ -354,7 +358,7 @@ def noises(samples: Mapping[str, np.ndarray], units: Mapping[str, str]) -> tuple
         white = np.concatenate([np.diff(p, _ORDER) for p in parts])
         # Subtract the variance of rounding, as the simulation rounds readings, too.
         variance = max(0.0, float(np.mean(white**2)) / _GAIN - quantum**2 / 12.0)
-        # Estimate the bias: the variance of the segments' means beyond that of noise.
+        # Estimate the bias: the variance of the segments' means, less the part that noise explains.
         means = np.array([p.mean() for p in parts])
         expected = float(np.mean([p.var() / p.size for p in parts]))
         bias = max(0.0, float(np.mean(means**2)) - expected)
@@ -364,17 +368,16 @@ def noises(samples: Mapping[str, np.ndarray], units: Mapping[str, str]) -> tuple
 
 
 def widening(at: Linearised, spread: Uncertainty) -> float:
-    """Return the factor on the deviations of the posterior with which its predictions cover the model's errors.
+    """Return the factor on the posterior's standard deviations with which predictions cover the model's errors.
 
-    The posterior is the uncertainty of the best parameters. It becomes narrow with long recordings, even if no
-    parameters explain them: a robot that the model does not describe acts, from moment to moment, like one with other
-    parameters. With this factor, the predictions of draws spread on average as widely as slow residuals. White noise of
-    the measurement does not count. Without slow residuals the factor is 1.
+    The posterior becomes narrow with long recordings, even if no parameters explain them: a robot that the model does
+    not describe acts, from moment to moment, like a robot with other parameters. With this factor, the predictions of
+    draws spread on average as widely as the slow part of the residuals. White noise does not count.
     """
     inside = np.broadcast_to(at.compared[:, None], at.raw.transpose(0, 2, 1).shape)
     total, white, count = (each.sum() for each in _squares(at))
     slow = max(0.0, total - white) / count if count else 0.0
-    # Compare it with the spread of the predictions.
+    # Compare the slow residuals with the spread of the predictions.
     J = at.jacobian.transpose(0, 2, 1, 3)[inside]
     predicted = float(np.einsum("np,pq,nq->n", J, spread.scale_covariance, J).mean()) if J.size else 0.0
     return float(np.sqrt(1.0 + slow / predicted)) if predicted > 0.0 else 1.0
@@ -405,7 +408,7 @@ def _squares(at: Linearised) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _quantum(readings: Sequence[float] | np.ndarray) -> float:
-    """Return the step that divides nearly all differences between readings; 0 without such a step."""
+    """Return the resolution of readings: the step that divides nearly all their differences; 0 without such a step."""
     levels = np.unique(np.asarray(readings, np.float64))
     steps = np.diff(levels)
     steps = steps[steps > 1e-6 * max(1e-12, float(np.ptp(levels)))] if levels.size > 1 else np.zeros(0)

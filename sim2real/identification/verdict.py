@@ -28,19 +28,19 @@ RECORD: Status = "record again"
 CHANGE: Status = "change the model"
 NOT_FINISHED: Status = "not finished"
 _BETTER = 0.95
-"""Largest ratio of the error to that of the model without delays with which delays are needed."""
+"""Delays are needed if the error is below this share of the error without delays."""
 _MOST = 3
-"""Most joints that the reasons name, the worst first."""
+"""Number of joints, the worst first, that reasons name."""
 _WIDER = 4.0
-"""Factor between the old and the new bound on a logarithmic scale."""
+"""Factor by which a bound on a logarithmic scale is widened."""
 _LONGEST_S = 1.0
-"""Longest delay that the flags allow [s]."""
+"""Longest delay that a suggested flag allows [s]."""
 _SECOND = "record a second log like "
-"""Begin of an advice within a reason."""
+"""Words with which an advice begins within a reason."""
 _ALONE = 0.99
-"""Share of the information on a parameter above which one part of the recordings determines it alone."""
+"""One part of the recordings determines a parameter alone if it holds this share of the information on it."""
 _APART = 2.0
-"""Ratio of the error on that part to that on each other one from which on it decides the expected error."""
+"""That part decides the expected error if the error on it is this many times the error on each other part."""
 
 
 def judge(
@@ -65,9 +65,9 @@ def judge(
         held_out: Errors of the joints, the worst first.
         x: Shape ``(P,)``: the estimate, on the parameters' scales.
         max_delay_s: Longest delay of the model [s].
-        widened: Parameters whose bounds the user has set: wider ones would not help again.
-        doubts: Further sentences, which decide nothing.
-        left: Length of the next step of a fit that did not converge [standard errors]; None if it converged.
+        widened: Parameters whose bounds the user has set already: wider bounds did not help.
+        doubts: Further sentences, which do not change the status.
+        left: Largest move in the next step of a fit that did not converge [standard errors]; None if it converged.
         exceeded: Sentences about errors on held-out parts above the expected ones.
         lacks: What the model lacks.
         too_seldom: A sentence on a log whose commands are logged too seldom for its motion, or "".
@@ -84,8 +84,9 @@ def judge(
     reasons = [*errors, *doubts, *bounded, *_absent(table, spread)]
     reasons += [f"{name} is estimated at its lowest possible value, 0; the fit is the same with 0" for name in at_zero]
     reasons += undetermined
-    # The first rule that holds decides the status, and its sentences come first. Wider bounds do not help a model that
-    # lacks a term, as it bends its other parameters; nor does another recording before terms and bounds are right.
+    # The first rule that holds decides the status, and its sentences come first. Terms come before bounds, because a
+    # missing     # term drives other parameters to their bounds; a new recording helps only once terms and bounds are
+    # right.
     lacking = [*lacks.reasons, *exceeded]
     rules: tuple[tuple[bool, Status, Sequence[str]], ...] = (
         (bool(lacks.flags), CHANGE, lacking),
@@ -98,7 +99,7 @@ def judge(
     )
     status, deciding = next((status, why) for holds, status, why in rules if holds)
     flags = lacks.flags or flags
-    if status == CHANGE and too_seldom:  # no model explains a motion between commands that the log lacks
+    if status == CHANGE and too_seldom:  # no model explains a motion whose commands are missing in the log
         status, deciding, flags = RECORD, [too_seldom, *deciding], ""
     elif status == CHANGE and not (flags or lacks.unexplained) and offers_terms():
         flags = "--terms auto"
@@ -111,14 +112,12 @@ def estimates(
     spread: Uncertainty | None = None,
     truth: Mapping[str, float] = MappingProxyType({}),
 ) -> tuple[Estimate, ...]:
-    """Return the rows of the parameters, those to identify first; the last row is the sum of the delays.
-
-    A parameter is ``ok``, ``at a bound``, ``not determined`` or ``fixed``, if the fit is accepted.
+    """Return a row for each parameter, the identified ones first; the last row is the sum of the delays.
 
     Args:
         spread: None: the estimates have no intervals.
-        truth: Known parameters. How the delay is shared between both sides of the world is a convention: only the sum
-            has a true value.
+        truth: Known values of parameters, in a simulation. Only the sum of the delays has a true value: how it is split
+            between commands and measurements is a convention.
     """
     rows = []
     for p in (*table.columns, *(p for p in table if not p.free)):
@@ -152,10 +151,10 @@ def _state_of(verdict: str, p: Parameter, upper: bool) -> str:
 
 
 def decisive_part(parts: Sequence[HeldOutPart], expected: Sequence[ExpectedError], fields: Mapping[str, str]) -> str:
-    """Return a sentence about the part that decides the expected error as it alone determines parameters, or "".
+    """Return a sentence about a part that decides the expected error because it alone determines parameters, or "".
 
-    A fit without that part has these parameters near their nominal values, and predicts the part far worse than a fit
-    of all recordings does.
+    A fit without the part leaves these parameters near their nominal values, and predicts the part far worse than a fit
+    of all recordings.
 
     Args:
         fields: Joint -> its measured field.
@@ -177,7 +176,7 @@ def decisive_part(parts: Sequence[HeldOutPart], expected: Sequence[ExpectedError
 
 
 def advised(reasons: Sequence[str]) -> str:
-    """Return which log to record as some reasons advise; "": none does."""
+    """Return the advice in reasons on which log to record; "" without an advice."""
     return next((_SECOND + reason.partition(_SECOND)[2] for reason in reasons if _SECOND in reason), "")
 
 
@@ -218,7 +217,7 @@ def _on_held_out(held_out: Sequence[ComparedError]) -> tuple[bool, list[str]]:
 
 
 def _beside_baselines(row: ComparedError) -> str:
-    """Return the error of a joint, and the baselines that are as good, or the best one."""
+    """Return the error of a joint with the baselines that are as good, or else with the best baseline."""
     sentence = str(replace(row, expected=None))
     finite = {name: e for name, e in row.baselines.items() if e is not None and name != WITHOUT_DELAYS}
     if row.as_good:
@@ -242,10 +241,9 @@ def _at_bounds(
     max_delay_s: float,
     widened: Collection[str],
 ) -> tuple[list[str], list[str], str]:
-    """Return sentences about estimates at a bound, names of those at their lowest possible value, and flags to widen.
+    """Return sentences about estimates at a bound, names of estimates at their lowest possible value, and flags.
 
-    Only parameters in ``determined`` count: wider bounds do not help a parameter that the data does not determine. Nor
-    do they help again where they were ``widened`` before.
+    The flags widen the bounds of parameters that are ``determined`` and not ``widened`` yet: others would not improve.
     """
     messages, at_zero, flags = [], [], []
     for i in determined:
@@ -278,7 +276,7 @@ def is_physical(p: Parameter, upper: bool) -> bool:
 
 
 def way_out(p: Parameter, upper: bool, max_delay_s: float) -> str:
-    """Return flags that widen the bound at which a parameter lies.
+    """Return flags that widen the bound at which an estimate lies.
 
     Args:
         max_delay_s: Longest delay of the model [s].
@@ -289,7 +287,7 @@ def way_out(p: Parameter, upper: bool, max_delay_s: float) -> str:
     if p.transform == "log":
         low, high = (low, high * _WIDER) if upper else (low / _WIDER, high)
     else:
-        below = low - (high - low)  # a share or a friction is not negative
+        below = low - (high - low)  # shares and frictions are not negative
         low, high = (low, high + (high - low)) if upper else (max(below, 0.0) if low > 0.0 else below, high)
     return f"--bounds {p.name} {low:.6g} {high:.6g}"
 

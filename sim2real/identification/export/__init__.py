@@ -1,1 +1,1 @@
-"""The estimates in the terms of other simulators: MJCF, mjlab, Isaac Lab, a JSON document, and a model card."""
+"""Export of an identification: MJCF, mjlab, Isaac Lab, a JSON document, and a model card."""

@@ -30,7 +30,7 @@ ALLOWED = 0.01
 LARGEST_BYTES = 50_000_000
 """Largest size of a card's signals."""
 RUNS = ("ahead", "free")
-"""Held-out segments of the horizon's length, and free runs."""
+"""Kinds of predictions: held-out segments as long as the horizon, and free runs."""
 _COLUMNS = (
     *("name", "unit", "kind", "about", "estimate", "standard_error"),
     *("low95", "high95", "lower", "upper", "state"),
@@ -39,7 +39,7 @@ _QUANTILES = {
     "times": (("q50", 0.5), ("q95", 0.95), ("q99", 0.99)),
     "log": (("lowest", 0.0), ("highest", 1.0)),
 }
-"""Kind of a signal -> the quantiles of it that are figures."""
+"""Kind of a signal -> its quantiles that are figures."""
 
 
 def json_document(
@@ -48,7 +48,7 @@ def json_document(
     """Return all results, for programs; docs/guides/export.md describes the document.
 
     Args:
-        terms: The robot in MuJoCo's terms; None where no MuJoCo model has it.
+        terms: The robot in MuJoCo's terms; None if the robot has no MuJoCo model.
     """
     mujoco = ("timestep_s", "joints", "bodies", "unexpressed")
     return {
@@ -71,7 +71,7 @@ def write_card(
     document: Mapping[str, Json],
     session: Mapping[str, Json],
 ) -> tuple[dict[str, Json], dict[str, np.ndarray]]:
-    """Write the card's folder without the page, and return the document and the signals.
+    """Write the card's folder without its page; return the document and the signals.
 
     Args:
         plain: The robot in plain MuJoCo; None: the card has no model, and no error of a simulation.
@@ -110,7 +110,7 @@ def differing(folder: Path) -> list[str]:
 def card_signals(
     identification: Identification, plain: PlainSimulation | None
 ) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Return the signals of a card, and a sentence if it has none that an error is computed from.
+    """Return the signals of a card, and a sentence if they do not suffice to compute an error.
 
     Returns:
         ``log/FIELD``, each measurement once; ``times/KIND/NODE``, in order [s]; and for each run of ``RUNS`` with R
@@ -155,7 +155,7 @@ def _held_out(identification: Identification, plain: PlainSimulation) -> dict[st
 
 
 def _figures(identification: Identification, signals: Mapping[str, np.ndarray]) -> Iterator[dict[str, Json]]:
-    """Yield errors on held-out parts, up to each horizon and in free runs, then recorded times and ranges of motion."""
+    """Yield the figures: errors up to each horizon and in free runs, times, ranges of motion."""
     units = identification.units
     for how, samples, pick, where in _runs(identification):
         for field in identification.fields:
@@ -174,7 +174,7 @@ def _figures(identification: Identification, signals: Mapping[str, np.ndarray]) 
 def _runs(
     identification: Identification,
 ) -> Iterator[tuple[str, Mapping[str, np.ndarray], np.ndarray, dict[str, Json]]]:
-    """Yield each kind of prediction of held-out parts: how, its columns, the rows that count, and its recipe."""
+    """Yield for each kind of prediction of held-out parts: its words, columns, the rows that count, and a recipe."""
     for run, samples in zip(RUNS, (identification.samples, identification.free), strict=True):
         if not samples:
             continue
@@ -209,7 +209,7 @@ def _unknown(identification: Identification) -> list[str]:
 
 
 def _simulation(identification: Identification, plain: PlainSimulation, model: IdentifiableModel) -> dict[str, Json]:
-    """Return the simulation for ``reproduce.py``; a field has 0 for a position or 1 for a velocity, and a joint."""
+    """Return the simulation for ``reproduce.py``; a field has 0 (position) or 1 (velocity), and its joint."""
     sides = {p.name: p.side for p in model.parameters}
     delays = [p for p in identification.parameters if p.kind == "delay"]
     late = {

@@ -1,9 +1,9 @@
-"""Compute the figures of a model card again: ``python reproduce.py`` needs numpy and mujoco, and this folder.
+"""Computes the figures of a model card again: ``python reproduce.py`` in this folder; needs numpy and mujoco.
 
 ``card.json`` holds the figures with their recipes and the numbers of the drives, ``model.xml`` the robot, and
 ``signals.npz`` the measurements and commands. The functions ``held``, ``setpoint``, ``drive`` and ``verlet`` are the
-equations of the drives and of the integrator. Each line shows the card's figure, the value of this script, and by how
-much they differ.
+equations of the drives and of the integrator. Each printed line has the card's figure, the value of this script, and
+their difference.
 """
 
 import json
@@ -19,10 +19,12 @@ import numpy as np
 FAR_S, NO_LIMIT = 1e3, 1e6
 Arrays = Mapping[str, np.ndarray]
 Untyped = Any
-"""Objects of mujoco, which has no types, and of JSON."""
+"""Objects of mujoco, which has no type hints, and of JSON."""
 Memory = dict[str, np.ndarray]
 Law = Callable[[Untyped, Untyped, Untyped, Arrays, Memory], None]
-"""Sets controls, forces and friction of one step from the model, its data, the drive's numbers, commands and memory."""
+"""A drive: sets controls, forces and friction of one step. Arguments: model, data, the drive's numbers, commands,
+memory.
+"""
 _mj: Untyped = mujoco
 
 
@@ -31,7 +33,7 @@ def tick_means(sent_s: np.ndarray, rows: np.ndarray, delay_s: float, tick_s: flo
     there = np.isfinite(sent_s)
     arrives_s = sent_s[there] + delay_s
     rows = rows[there].reshape(len(arrives_s), -1)
-    # The integral of held commands is linear between arrivals; the first command holds before, and the last one after.
+    # The integral of the command is linear between arrivals; the first command also holds before it arrives.
     knots = np.concatenate([[arrives_s[0] - FAR_S], arrives_s, [arrives_s[-1] + FAR_S]])
     held = np.concatenate([rows[:1], rows])
     integral = np.concatenate([np.zeros((1, rows.shape[1])), np.cumsum(held * np.diff(knots)[:, None], axis=0)])
@@ -64,7 +66,7 @@ def drive(model: Untyped, data: Untyped, numbers: Untyped, command: Arrays, memo
     n = {name: np.array(value) for name, value in numbers.items()}
     zero, one = np.zeros(len(n["kp"])), np.ones(len(n["kp"]))
     at, dof = n["qpos_at"], n["qvel_at"]
-    # The control: gains of the log count in the log's units; with torque off a share of the damping is left.
+    # The control: gains of the log are in the log's units; with torque off, a share of the damping remains.
     on = command.get("enabled", one) + zero
     goal = command["goal"] - n["zero"] if "goal" in command else zero
     usual = command.get("volts", n["volts_unit"]) / n["volts_unit"]
@@ -77,7 +79,7 @@ def drive(model: Untyped, data: Untyped, numbers: Untyped, command: Arrays, memo
     kd = n["kd"] * (command["kd"] / n["kd_unit"] if "kd" in command else one) * (on + (one - on) * n["released"])
     force = kp * goal + on * kd * command.get("goal_velocity", zero)
     force = force + on * strength * n["gain"] * (command.get("torque", zero) + command.get("duty", zero))
-    # The terms of friction, dead zone, back-EMF and cogging, which are 0 unless they were identified.
+    # Friction, dead zone, back-EMF and cogging, which are 0 unless they were identified.
     if "load" in n:
         usual = memory.setdefault("usual", np.stack([model.dof_damping[dof], model.dof_frictionloss[dof]]))
         angle, speed, limit = data.qpos[at], data.qvel[dof], model.jnt_actfrcrange[n["joints_at"], 1]
@@ -102,7 +104,7 @@ LAWS: Mapping[str, Law] = {"held": held, "setpoint": setpoint, "drive": drive}
 
 
 def verlet(model: Untyped, data: Untyped) -> None:
-    """Move joints that do not act on each other by a step of position Verlet, with exact dry friction."""
+    """Move independent joints by a step of position Verlet, with exact dry friction."""
     h, before, position = model.opt.timestep, data.qvel.copy(), data.qpos.copy()
     # MuJoCo gives inertia, gravity and drive at the middle of the step.
     data.qpos[:] = position + 0.5 * h * before
@@ -112,7 +114,7 @@ def verlet(model: Untyped, data: Untyped) -> None:
     damping, dry = model.dof_damping / inertia.diagonal(), h * model.dof_frictionloss / inertia.diagonal()
     push = h * (data.qfrc_actuator + data.qfrc_applied - data.qfrc_bias) / inertia.diagonal()
     moving = before * (1.0 - 0.5 * h * damping)
-    # Friction opposes the motion until it stops; for the rest of the step the joint sticks, or moves the other way.
+    # Friction opposes the motion until the joint stops; in the rest of the step it sticks, or moves the other way.
     slowed = moving + push - np.sign(moving) * dry
     turns = np.sign(moving) * slowed < 0.0
     rest = np.where(turns, slowed / np.where(turns, slowed - moving, 1.0), 1.0)
@@ -129,7 +131,7 @@ def readings(
     Args:
         drives: The entry ``simulation`` of the card. ``law`` names the function of ``LAWS`` that drives joints, with
             ``numbers``; commands act ``command_delay_s`` after they were sent, and the drive's ``lead_s`` later.
-        run: ``ahead`` or ``free``: the segments of which kind.
+        run: Kind of the segments: ``ahead`` (up to the horizon) or ``free`` (a free run).
     """
     model = _mj.MjModel.from_xml_string(xml)
     data, law, memory = _mj.MjData(model), LAWS[drives["law"]], {}
@@ -153,7 +155,7 @@ def readings(
         for _ in range(substeps):
             law(model, data, drives["numbers"], command, memory)
             step(model, data)
-        # Velocities of a leapfrog are those of half a step before.
+        # A leapfrog has the velocities of half a step before.
         moved.append((data.qpos[at].copy(), data.qvel[dof] + drives["velocity_lead_s"] * data.qacc[dof]))
     read = ts - drives["measurement_delay_s"]
     position, speed = (
@@ -168,7 +170,7 @@ def readings(
 
 
 def predictions(xml: str, drives: Untyped, signals: Arrays, run: str) -> dict[str, np.ndarray]:
-    """Return field -> error of the simulation ``(N,)`` at each measurement of the segments ``ahead`` or ``free``."""
+    """Return field -> simulation minus measurement ``(N,)``, at each measurement of the segments of kind ``run``."""
     segments, ts = signals[f"{run}/row"], signals[f"{run}/into"]
     errors = {name: np.full(len(ts), np.nan) for name in drives["fields"]}
     for segment in np.unique(segments):
@@ -191,9 +193,9 @@ class Card:
         self._errors: dict[str, dict[str, np.ndarray]] = {}
 
     def value(self, recipe: Untyped) -> float:
-        """Return the number of a recipe of ``card.json``: a quantile of a signal, or an error of the simulation.
+        """Compute a figure by its recipe in ``card.json``: a quantile of a signal, or an error of the simulation.
 
-        An error is the root mean square of simulation less measurement of a field, up to a horizon.
+        An error is the root mean square of simulation minus measurement of a field, up to a horizon.
         """
         if "signal" in recipe:
             values = self.signals[recipe["signal"]]

@@ -1,8 +1,8 @@
-"""A robot for other simulators: MJCF that C MuJoCo takes as it is, and Python files for mjlab 1.6 and Isaac Lab 2.x.
+"""A robot for other simulators: MJCF for C MuJoCo, and Python files for mjlab 1.6 and Isaac Lab 2.x.
 
-MJCF has delays and profiles in MuJoCo's own terms, and intervals as numerics. The Python files, with actuators and
-ranges, are made from templates. https://mujocolab.github.io/mjlab, https://isaac-sim.github.io/IsaacLab (on Isaac Sim 5
-and later).
+The MJCF has delays and speed limits of setpoints as MuJoCo's elements, and intervals as ``numeric`` elements. The
+Python files, with actuators and ranges of randomisation, are made from templates. https://mujocolab.github.io/mjlab,
+https://isaac-sim.github.io/IsaacLab (on Isaac Sim 5 and later).
 """
 
 import math
@@ -19,17 +19,18 @@ from sim2real.identification.export.terms import Term, Terms
 
 _mj: Any = mujoco
 _LINEAR = 1
-"""Interpolation in a history: of held commands it gives their mean over a step, as in the identified graph."""
+"""Interpolation in MuJoCo's history buffer: it gives the mean of the command over a step, as in the identified graph.
+"""
 TARGETS = {"mjlab": "mjlab", "isaaclab": "Isaac Lab"}
-"""Target, which is the name of its template -> its name in texts."""
+"""Target, which also names its template -> its name in texts."""
 
 
 @dataclass(frozen=True)
 class Late:
-    """The timing of a robot that the text of its model does not hold.
+    """The timing of a robot that its MJCF does not hold.
 
     Attributes:
-        lead_s: Time that is added to the delay of commands [s], for the integrator's sake.
+        lead_s: Time that is added to the delay of commands, as the integrator moves joints early [s].
         profile_rad_s: How fast setpoints move to goals; infinite: at once.
     """
 
@@ -72,13 +73,13 @@ def _follow(actuator: Any, profile_rad_s: float) -> None:
 
 
 def _delay(element: Any, delay_s: float, step_s: float) -> None:
-    """Let an actuator or a sensor be late, where that is more than nothing."""
+    """Delay an actuator or a sensor by ``delay_s``, if it is above 0."""
     if delay_s > 0.0:
         element.delay, element.nsample, element.interp = delay_s, math.ceil(delay_s / step_s) + 2, _LINEAR
 
 
 def _keep(spec: Any, terms: Terms, about: Sequence[tuple[str, str]]) -> None:
-    """Write the intervals, three numbers each: the estimate and both ends, and further facts about the file."""
+    """Write each interval as three numbers (estimate and both ends), and further facts about the file."""
 
     def number(name: str, term: Term | None) -> None:
         if term is not None and not term.known:
@@ -121,7 +122,7 @@ def source_of(target: str, terms: Terms, title: str, about: Sequence[tuple[str, 
         "text": lambda text: text.replace("\\", "/").replace('"', "'"),
         "identifier": lambda name: re.sub(r"\W", "_", name),
     }
-    # Lags are the least and the largest round trip, in steps of the physics.
+    # Lags are the shortest and the longest round trip, in steps of the physics.
     trip, step_s = terms.delays.round_trip, terms.timestep_s
     least, most = (0, 0) if trip is None else (math.floor(trip.low / step_s), math.ceil(trip.high / step_s))
     driven = {name: own for name, own in terms.joints.items() if "stiffness" in own}

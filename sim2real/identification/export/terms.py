@@ -1,7 +1,7 @@
-"""An identification in MuJoCo's own terms: every field of the model that it sets, with the interval that is left open.
+"""An identification in MuJoCo's terms: every field of the model that it determines, with an interval.
 
-No table says which parameter belongs to which field. Each robot drawn from the posterior is made a model of, and what
-differs between those models is what was identified: shared parameters and derived limits come out right by themselves.
+No table maps parameters to fields. Robots are drawn from the posterior, and a model is compiled of each: the fields
+that differ between the models were identified, also by parameters that several joints share.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -15,7 +15,7 @@ from sim2real.artifacts.identification import ROUND_TRIP, Estimate, Identificati
 from sim2real.artifacts.timing import Spread
 
 DRAWS = 200
-"""Robots drawn from the posterior; an end of a 95 % interval then varies by a twelfth of its width."""
+"""Number of robots drawn from the posterior: the ends of a 95 % interval then vary by a twelfth of its width."""
 _mj: Any = mujoco
 _HINGE_OR_SLIDE = (int(_mj.mjtJoint.mjJNT_HINGE), int(_mj.mjtJoint.mjJNT_SLIDE))
 _DOF = {"damping": "dof_damping", "armature": "dof_armature", "frictionloss": "dof_frictionloss"}
@@ -32,7 +32,7 @@ class Term:
 
     @property
     def known(self) -> bool:
-        """Whether the interval is a point: nothing about it was identified."""
+        """Whether the interval is a point: the identification does not change this number."""
         return self.low == self.high
 
 
@@ -43,7 +43,7 @@ class Delays:
     Attributes:
         command: From a command's departure to its effect.
         measurement: From a motion to the stamp of its measurement.
-        round_trip: Both together, which a log determines even if it does not separate them.
+        round_trip: Sum of both, which a log determines even if it does not separate them.
         computation: Node -> from the start of a step to its end, as recorded.
     """
 
@@ -60,10 +60,10 @@ class Terms:
     Attributes:
         joints: Joint -> ``damping``, ``armature``, ``frictionloss`` and, where an actuator drives it, ``stiffness``,
             ``actuator_damping``, ``effort_limit``, and ``gain`` if its command is no position.
-        bodies: Body -> ``mass``, ``ipos[i]``, ``inertia[i]``, those that were identified.
+        bodies: Body -> ``mass``, ``ipos[i]``, ``inertia[i]``, if they were identified.
         delays: The delays.
         timestep_s: Step of the model's physics [s].
-        unexpressed: Parameters that set nothing in the model.
+        unexpressed: Parameters that set no field of the model.
     """
 
     joints: Mapping[str, Mapping[str, Term]]
@@ -142,7 +142,7 @@ def _draws(found: Identification, count: int) -> list[dict[str, float]]:
 
 
 def _numbers(model: Any) -> dict[tuple[str, str, str], float]:
-    """Return what the terms are about: (``joint`` or ``body``, its name, the term) -> number."""
+    """Return the model's numbers: (``joint`` or ``body``, its name, the term) -> number."""
     found: dict[tuple[str, str, str], float] = {}
     for j in range(model.njnt):
         if model.jnt_type[j] in _HINGE_OR_SLIDE:
@@ -172,7 +172,7 @@ def _numbers(model: Any) -> dict[tuple[str, str, str], float]:
 def _unexpressed(
     found: Identification, mjcf: Callable[[Mapping[str, float]], str], best: Mapping[str, float]
 ) -> list[str]:
-    """Return the parameters without which the model would be the same, but for delays."""
+    """Return the parameters, except delays, that do not change the model."""
     names = {p.name: p for p in found.parameters if p.kind not in ("delay", "derived")}
     # An optional term that is not part of the model sets no field.
     names = {name: p for name, p in names.items() if p.state != "fixed" or p.estimate != p.nominal}
