@@ -23,21 +23,22 @@ from sim2real.hardware.bus.servos import ServoJoint
 from sim2real.hardware.feetech import StsServos
 
 _SHARE_OF_TRAVEL: Final = (0.75, 1.3)
-"""Least and largest range that a joint may have, as a share of its travel. Of SO-101 calibrations that are public the
-ranges are 0.81 to 1.27 of the description's travel, the most at grippers; those across the encoder's seam 1.6 to 3.3.
+"""Smallest and largest range of a joint, as a share of its travel. In public calibrations of SO-101 the ranges are 0.81
+to 1.27 of the travel in the URDF, and 1.6 to 3.3 where the joint crossed the seam between counts 4095 and 0.
 """
 _WHOLE_TURN: Final = 0.97
-"""Share of a revolution from which on a range is called a whole turn."""
+"""A range counts as a whole turn from this share of a revolution on."""
 _MOVED_RAD: Final = 0.3
-"""Motion of a joint by hand from which on it counts as moved [rad]."""
+"""A joint counts as moved by hand if it turned by this angle [rad]."""
 _END_RAD: Final = 0.1
-"""Largest distance of a joint's stop from the end of its calibrated range [rad]; the zero, the middle of both, is
-then wrong by at most as much."""
+"""Largest distance of a joint's stop from the end of its calibrated range [rad]; the zero, in the middle of the range,
+is then wrong by at most this angle.
+"""
 _MIDDLE_RAD: Final = 0.7
 """Largest distance of a joint from its zero in the middle pose, which a person finds by eye [rad]."""
 _STILL_RAD, _STILL_S, _SETTLED_S = 0.05, 0.5, 1.0
 _POSED_S: Final = 3.0
-"""How long all joints rest in a wrong middle pose before it counts as a finding [s]."""
+"""A wrong middle pose is reported after all joints have rested in it for this time [s]."""
 _CALIBRATE: Final = "calibrate again: begin with every joint in the middle, then move each from stop to stop"
 _PERIOD_S: Final = 0.02
 _LONGEST_S: Final = 600.0
@@ -59,7 +60,7 @@ def read_calibration(path: Path | str, travel_rad: Mapping[str, float] | None = 
     to count 0 while its range is recorded gets the range 0 to 4095, for any travel.
 
     Args:
-        travel_rad: Joint -> angle from stop to stop [rad]; other joints may have any range, as one that turns freely.
+        travel_rad: Joint -> angle from stop to stop [rad]; the range of other joints is not checked.
 
     Raises:
         UsageError: There is no such file, it is not a calibration, or a range is far from the joint's travel.
@@ -127,8 +128,8 @@ class Nudge:
 class HandMotion:
     """A person moves the joints by hand, with torque off: the middle pose, a nudge of each joint, all stops.
 
-    It follows the counts of the encoders, and compares with the calibration which servo moves which joint, in which
-    direction and how far.
+    It reads the encoders, and checks against the calibration which servo moves which joint, in which direction, and how
+    far.
 
     Args:
         joints: The robot's calibrated joints.
@@ -142,7 +143,7 @@ class HandMotion:
         self.joints, self.nudges = joints, nudges
         self._place = {joint.name: i for i, joint in enumerate(joints)}
         self._bounded = [self._place[nudge.joint] for nudge in nudges if nudge.travel_rad is not None]
-        # Counts: now, at the first measurement, where all joints last moved, and the lowest and highest so far.
+        # Counts: now; at the first measurement; when all joints last moved; the lowest and highest so far.
         self._counts = self._first = self._anchor = self._low = self._high = np.zeros(0)
         self._still_s = self._still_since_s = 0.0
         self._steps = self._follow()
@@ -157,7 +158,7 @@ class HandMotion:
         if not self._counts.size:
             self._counts = self._first = self._anchor = counts.astype(np.float64)
             self._still_since_s = t_s
-        # Unwrap them at the encoder's seam, and note for how long all joints have rested.
+        # Unwrap the counts at the encoder's seam, and note for how long all joints have rested.
         half = reg.COUNTS_PER_REVOLUTION / 2
         self._counts = self._counts + (counts - self._counts + half) % reg.COUNTS_PER_REVOLUTION - half
         if np.any(self._moved(self._anchor) > _STILL_RAD):
@@ -173,7 +174,7 @@ class HandMotion:
         return False
 
     def _follow(self) -> Iterator[str]:
-        """Yield the instruction after each measurement, until the motion is complete."""
+        """Yield the present instruction after each measurement, until the motion is complete."""
         yield (words := "hold the arm with every joint in the middle of its travel, and keep it still for a second")
         while not self._is_in_the_middle():
             yield words
@@ -193,7 +194,7 @@ class HandMotion:
             yield "move to both stops: done"
 
     def _moved(self, since: np.ndarray) -> np.ndarray:
-        """Return the distance of each joint from earlier counts [rad]."""
+        """Return the distance of each joint from its counts ``since`` [rad]."""
         return np.abs(self._counts - since) * reg.RAD_PER_COUNT
 
     def _is_in_the_middle(self) -> bool:
@@ -202,18 +203,18 @@ class HandMotion:
             return False
         angles = [joint.angle(count) for joint, count in zip(self.joints, self._counts, strict=True)]
         wrong = [i for i in sorted(self._bounded) if abs(angles[i]) > _MIDDLE_RAD]
-        # An arm that was not moved yet lies where it was put away.
+        # The arm still lies where it was put away: no joint was moved yet.
         if wrong and self._still_s >= _POSED_S and np.any(self._moved(self._first) > _MOVED_RAD):
             there = ", ".join(f"{self.joints[i].name} {math.degrees(angles[i]):.0f} degrees" for i in wrong)
             raise HardwareLost(
-                f"in the middle pose these joints should be near 0 degrees, and are at: {there}",
+                f"in the middle pose these joints should be near 0 degrees, but are at {there}",
                 hint=f"hold the arm in the middle pose and start again; if it was there, {_CALIBRATE}",
             )
         return not wrong
 
     def _is_nudged(self, nudge: Nudge, base: np.ndarray, nudged: set[str]) -> bool:
         """Return whether the joint of the instruction has moved, in the direction of the calibration."""
-        # A joint that was nudged before is identified: its motion decides nothing.
+        # A joint that was nudged before is known already: ignore its motion.
         far = [self.joints[i] for i in np.flatnonzero(self._moved(base) > _MOVED_RAD).tolist()]
         far = [joint for joint in far if joint.name not in nudged]
         if not far:
@@ -232,7 +233,7 @@ class HandMotion:
             raise HardwareLost(
                 f"{nudge.joint} turned in the other direction than '{nudge.words}': by the calibration its angle "
                 f"{'fell' if nudge.direction > 0 else 'rose'}",
-                hint="its servo is mounted turned, or drive_mode of the calibration is wrong",
+                hint="its servo is mounted the other way round, or drive_mode of the calibration is wrong",
             )
         return True
 

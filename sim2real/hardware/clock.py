@@ -8,18 +8,18 @@ from typing import Final, Protocol
 
 
 class Clock(Protocol):
-    """The time of a device and of everything that watches it; `sleep` returns after a time [s]."""
+    """The time of a device and of its watchdogs; `sleep` returns after a time [s]."""
 
     def now_ns(self) -> int: ...
     def sleep(self, duration_s: float) -> None: ...
 
     def repeat(self, call: Callable[[], None], period_s: float, done: threading.Event, name: str) -> None:
-        """Call a function that raises nothing, now and after every period until ``done`` is set, beside the caller."""
+        """Call a function now and after every period until ``done`` is set, in parallel to the caller."""
         ...
 
 
 class SystemClock:
-    """CLOCK_MONOTONIC; what it repeats runs in a thread of its own."""
+    """CLOCK_MONOTONIC; `repeat` runs in a thread."""
 
     def now_ns(self) -> int:
         return time.monotonic_ns()
@@ -31,7 +31,7 @@ class SystemClock:
         """Start a daemon thread with the priority of a control loop."""
 
         def run() -> None:
-            with suppress(Exception):  # a slower thread is better than none
+            with suppress(Exception):  # without the priority the thread is slower, but it runs
                 from sim2real.runtime.clock import keep_time  # the emulators' processes do not need the runtime
 
                 keep_time()

@@ -24,8 +24,8 @@ class Transaction:
     """The times of one instruction with its answer and its retries.
 
     Args:
-        t_sent_ns: Time at which the answered instruction was sent, CLOCK_MONOTONIC [ns].
-        lock_wait_ns: Wait for another thread's use of the bus [ns].
+        t_sent_ns: Time at which the instruction was sent, in its last attempt, CLOCK_MONOTONIC [ns].
+        lock_wait_ns: Time of waiting for another thread to release the bus [ns].
         transfer_ns: Time from getting the bus to having the answer, retries included [ns].
         late_ns: Delay of the answer beyond the time of its bytes on the wire [ns].
     """
@@ -39,13 +39,13 @@ class Transaction:
 
 @dataclass(frozen=True)
 class ReadingPart:
-    """A part of a reading beside positions, velocities and loads, such as the gyro's rates.
+    """A further part of a reading, such as the gyro's rates.
 
     Args:
         shape: Shape of its values; () is one number.
         low: Lowest value that is possible; a lower one stops the robot.
         high: Highest value that is possible.
-        norm: Lowest and highest norm of the values that is possible, such as that of a quaternion; None: any.
+        norm: Lowest and highest possible norm of the values, such as of a quaternion; None: any.
     """
 
     unit: str
@@ -96,7 +96,7 @@ class Counters:
 
 
 Stale: TypeAlias = Literal["zero", "hold"] | float
-"""The safe replacement of a stale command: zero, the last command again, or this number."""
+"""What replaces a stale command: zero, the last command again (``hold``), or this number."""
 
 
 @dataclass(frozen=True)
@@ -154,27 +154,27 @@ RESPONSE_S: Final = 0.2
 
 @dataclass(frozen=True)
 class Following:
-    """How the joints of a robot follow their commands, as far as that is certain.
+    """Bounds on how far the joints of a sound robot deviate from their commands.
 
-    Goals: ``response_s`` after a goal was sent, the joint is there, or travels there at ``speed_rad_s`` or faster. So
-    it lies between the goals of the last ``response_s``, or on the way to them, moved by ``weight``; it is away from
-    there by at most ``limit``.
+    Goals: ``response_s`` after a goal was sent, the joint has reached it, or moves towards it at ``speed_rad_s`` or
+    faster. So the joint lies between the goals of the last ``response_s``, or on the way to them, shifted by
+    ``weight``; it deviates from there by at most ``limit``.
 
-    Torques, if ``most_nm`` is given: the load that a motor reports is weaker than the torque of its law
-    ``tau + kp (q - position) + kd (dq - velocity)`` by at most ``limit``, on average over ``response_s``.
+    Torques, if ``most_nm`` is given: the load that a motor reports is weaker than the commanded torque ``tau + kp (q -
+    position) + kd (dq - velocity)`` by at most ``limit``, on average over ``response_s``.
 
-    Pushes, if ``push`` is given: of the acceleration by its command a joint lacks at most the share ``limit``, in the
-    motion of the last ``response_s``.
+    Pushes, if ``push`` is given: over ``response_s``, a joint's acceleration falls short of the one due to its command
+    by at most the share ``limit``.
 
     Attributes:
         limit: Largest deviation, one value or one per joint [rad, N m, or 1].
         speed_rad_s: One value or one per joint.
         source: Where the figures come from, for messages.
-        weight: Returns for positions ``(n,)`` by how much weight and dry friction move each joint off its goal, the
-            lowest and the highest value [rad]; None: ``limit`` includes that.
-        most_nm: Torque that each motor reaches, one value or one per joint; None: goals are compared.
-        push: Returns for positions, velocities and commands ``(n,)`` the acceleration of each joint without its
-            command, that by its command, and the largest one by dry friction [rad/s^2].
+        weight: Returns for positions ``(n,)`` by how much weight and dry friction move each joint off its goal: the
+            lowest and the highest value [rad]; None: ``limit`` includes them.
+        most_nm: Largest torque of each motor, one value or one per joint; None: goals are compared.
+        push: Returns for positions, velocities and commands ``(n,)`` three accelerations of each joint [rad/s^2]:
+            without its command, due to its command, and the largest one due to dry friction.
         speeds: Returns for positions ``(n,)`` the speed of each joint towards smaller and towards larger angles, in
             place of ``speed_rad_s`` [rad/s].
         delay_s: Time from a command to the measurement that shows it, for pushes [s].
@@ -203,21 +203,21 @@ class Device(ABC):
     commands have shape (n,), or (n, k) if `commanded` has k columns, float64, in the order of `motors`. Every method
     may be called from any thread while the device is open, `make_safe` from a signal handler too.
 
-    The ways out bring the motors into the device's safe state. That is torque off, unless the robot would fall: the
-    motors of legs damp their joints until the robot lies, and only then is the torque off.
+    `disable`, `make_safe` and `close` bring the motors into the device's safe state. That is torque off, unless the
+    robot would fall: the motors of legs damp their joints until the robot lies, and then go off.
 
     Methods raise HardwareLost when the device does not answer within its limits, and SafetyStop when a motor has
     stopped itself or the torque was taken off from outside.
 
     Attributes:
-        motors: Names of the motors, for messages, e.g. ``servo 1``. This and the following ones hold also before it is
-            opened.
+        motors: Names of the motors, for messages, e.g. ``servo 1``. All attributes but ``clock`` are valid before
+            `open`.
         commanded: The quantity of a command.
-        silence_s: Longest time without an instruction while torque is on, after which it is taken off [s]; 0:
+        silence_s: Longest time without an instruction while torque is on; then the torque is taken off [s]; 0:
             unlimited.
-        load_unit: Unit of a reading's load; by default a share of the largest.
+        load_unit: Unit of a reading's load; by default the share of the largest load.
         parts: Name -> further part of a reading.
-        clock: The clock of the stamps of readings, and of everything that watches the device; once it is open.
+        clock: The clock of the readings' stamps and of the watchdogs; valid once the device is open.
     """
 
     motors: tuple[str, ...]
@@ -250,7 +250,7 @@ class Device(ABC):
 
     @abstractmethod
     def without_host(self) -> tuple[str, ...]:
-        """Return the reaction of the motors to the death of this process, as phrases: MODEL (MOTORS) goes on, ..."""
+        """Return how the motors react when this process dies, as phrases: MODEL (MOTORS) goes on, ..."""
 
     def facts(self) -> Mapping[str, Mapping[str, str]]:
         """Return ``firmware``, ``voltage`` and ``temperature`` of each motor, as text, read from the open device.
@@ -263,14 +263,14 @@ class Device(ABC):
     def reach(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the lowest and the highest command that the motors follow, each of shape (n,) or (n, k).
 
-        A gate with wider limits is refused, as a motor may ignore such a command without an error. Infinite: there is
-        no such limit, or `command` raises.
+        A gate with wider limits is refused, because a motor may ignore such a command without an error. Infinite: there
+        is no limit, or `command` raises beyond it.
         """
 
     def following(self) -> Following | None:
-        """Return how the motors follow their commands, by their own figures, read from the open device.
+        """Return bounds on how the motors follow their commands, from the settings of the open device.
 
-        Default: None, it is not known, and nobody notices a motor that has let go.
+        Default: None, not known: then no check notices a motor that has let go.
         """
         return None
 
@@ -278,23 +278,23 @@ class Device(ABC):
     def enable(self) -> np.ndarray:
         """Write the settings that motors lose without power, and switch the torque on; the motors stay at rest.
 
-        Before torque goes on, a watcher outside of this process starts: it takes the torque off when this process dies,
-        or is silent for longer than `silence_s`.
+        First a guardian outside of this process starts: it takes the torque off when this process dies, or is silent
+        for longer than `silence_s`.
 
         Returns:
             The command that the motors follow from now on, ``(n,)`` or ``(n, k)``.
 
         Raises:
             SafetyStop: `make_safe` was called before, or the torque has been taken off from outside.
-            HardwareLost: A motor does not answer, or the watcher does not start.
+            HardwareLost: A motor does not answer, or the guardian does not start.
         """
 
     @abstractmethod
     def measure(self) -> Reading:
         """Read all motors.
 
-        A device that sends its state without a request returns the first sample that was taken after the call, so
-        that its time lies within the step that reads it.
+        A device that sends its state without a request returns the first sample taken after the call, so that the
+        sample's time lies within the step that reads it.
 
         Raises:
             SafetyStop: A motor has stopped itself.
@@ -315,18 +315,18 @@ class Device(ABC):
 
     @abstractmethod
     def check(self) -> None:
-        """Raise SafetyStop for a motor that has stopped or lost its settings and does not report it in its answers.
+        """Raise SafetyStop if a motor has stopped or lost its settings, where its answers do not report it.
 
-        Called twice a second before a measurement, which it delays; empty if all answers carry such errors.
+        Called twice a second before a measurement, which it delays; does nothing if all answers report such errors.
         """
 
     def require_watching(self) -> None:  # noqa: B027
-        """Raise SafetyStop if the process that watches this one has taken over; empty without such a process."""
+        """Raise SafetyStop if the guardian has taken over; does nothing without a guardian."""
 
     @property
     @abstractmethod
     def counters(self) -> Counters:
-        """Counts of the transactions since `open`; all zero before."""
+        """Counts of the transactions since `open`; zeros before `open`."""
 
     # -- the ways out
 
@@ -334,8 +334,8 @@ class Device(ABC):
     def disable(self) -> None:
         """Bring the motors into the safe state, then torque off, confirmed by every motor; `enable` may follow.
 
-        A motor that does not confirm keeps no other one on: all are switched off, then the error is raised. Until the
-        next `enable` the device sends nothing that could move a motor, not even what another thread has begun.
+        If a motor does not confirm, the error is raised after all others were switched off. Until the next `enable` the
+        device sends nothing that could move a motor, even if another thread has begun to.
 
         Raises:
             HardwareLost: A motor does not answer.

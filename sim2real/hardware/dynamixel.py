@@ -111,9 +111,11 @@ COUNTS_PER_REVOLUTION: Final = 4096
 RAD_PER_COUNT: Final = 2.0 * math.pi / COUNTS_PER_REVOLUTION
 RAD_S_PER_COUNT: Final = 0.229 * 2.0 * math.pi / 60.0  # velocity registers count in units of 0.229 rpm
 PWM_FULL_SCALE: Final = 885  # counts at 100 % of the supply voltage
-P_GAIN_PER_PWM: Final = 256  # P gain that turns a count of error into a count of PWM: measured on XL330 (e-Manual: 128)
-LOAD_FULL_SCALE: Final = 1000  # load registers count in units of 0.1 %
-DRIVE_REVERSED: Final = 1  # bit of Drive Mode; others: profiles by time instead of speed, goals that switch torque on
+# P gain with which one count of error gives one count of PWM: measured on XL330 (e-Manual: 128).
+P_GAIN_PER_PWM: Final = 256
+LOAD_FULL_SCALE: Final = 1000  # load registers have units of 0.1 %
+# Bit of Drive Mode; other bits: profiles by time instead of speed, goals that switch torque on.
+DRIVE_REVERSED: Final = 1
 
 # Bits of Hardware Error Status; the servo switches its own torque off when one of them is set.
 HARDWARE_ERRORS: Final[dict[int, str]] = {
@@ -215,8 +217,8 @@ def model(number: int) -> ServoModel:
 class DynamixelServos(Servos):
     """DYNAMIXEL X servos on one port; see `Servos`.
 
-    Their bus watchdogs are set to `silence_s`, in multiples of 20 ms; the reaction to a tripped one depends on the
-    model.
+    Their bus watchdogs are set to `silence_s`, in multiples of 20 ms; what a servo does when its watchdog trips depends
+    on the model.
     """
 
     family = FAMILY
@@ -227,11 +229,11 @@ class DynamixelServos(Servos):
         return model(number)
 
     def prepare(self, joint: ServoJoint) -> None:
-        """Have profiles by speed, and goals that switch no torque on."""
+        """Set profiles by speed, and goals that do not switch torque on."""
         self.link.set(joint.servo_id, DRIVE_MODE, self.link.read(joint.servo_id, DRIVE_MODE) & DRIVE_REVERSED)
 
     def failure(self, answer: Answer, what: str) -> Exception:
-        """Return SafetyStop for the alert bit and a tripped watchdog; other errors concern this instruction."""
+        """Return SafetyStop for the alert bit or a tripped watchdog, else the reason why the servo refused ``what``."""
         servo_id, error = answer.servo_id, answer.error
         if error & ALERT_BIT:
             bits = self.link.read(servo_id, HARDWARE_ERROR_STATUS, despite_error=True)

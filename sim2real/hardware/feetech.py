@@ -27,7 +27,7 @@ from sim2real.hardware.device import POSITION
 HEADER: Final = b"\xff\xff"
 
 ALARMS: Final[dict[int, str]] = {0: "input voltage", 1: "encoder", 2: "overheating", 3: "overcurrent", 5: "overload"}
-"""Bit of the error byte, and of the register Status -> its name. Every status packet carries them."""
+"""Name of each bit of the error byte, which every status packet has, and of the register Status."""
 
 
 def checksum(body: bytes | bytearray) -> int:
@@ -71,7 +71,7 @@ RAD_PER_COUNT: Final = 2.0 * math.pi / COUNTS_PER_REVOLUTION
 DUTY_PER_RAD_AND_GAIN: Final = 0.166  # duty for a radian of error and a P gain of 1: measured by Rhoban (BAM, STS3215)
 LOAD_FULL_SCALE: Final = 1000  # load and torque registers count in units of 0.1 %
 FASTEST_COUNTS_PER_S: Final = 3400
-"""Speed of the setpoint at power-up, measured by Rhoban (BAM): about the motor's speed without load."""
+"""Speed of the setpoint after power-up, measured by Rhoban (BAM): about the motor's speed without load."""
 BAUD_RATES: Final = (1_000_000, 500_000, 250_000, 128_000, 115_200, 76_800, 57_600, 38_400)
 """Bits per second, by the value of the register Baud Rate."""
 
@@ -92,10 +92,10 @@ RESPONSE_LEVEL = eeprom("response_level", 8, 1, 0, 1, 1)
 MIN_POSITION = eeprom("min_position", 9, 2, 0, 4094, 0)
 MAX_POSITION = eeprom("max_position", 11, 2, 0, 4095, 4095)
 MAX_TEMPERATURE = eeprom("max_temperature", 13, 1, 0, 100, 70)
-MAX_VOLTAGE = eeprom("max_voltage", 14, 1, 0, 254, 140)  # assumed: that of a servo for 12 V; in units of 0.1 V
+MAX_VOLTAGE = eeprom("max_voltage", 14, 1, 0, 254, 140)  # assumed: the value of a servo for 12 V; in units of 0.1 V
 MIN_VOLTAGE = eeprom("min_voltage", 15, 1, 0, 254, 40)
 MAX_TORQUE = eeprom("max_torque", 16, 2, 0, 1000, 1000)
-# Default assumed: the protocol manual's examples have speeds in counts/s; LeRobot leaves speeds alone, and servos move.
+# Assumed default: the protocol manual's examples have speeds in counts/s; LeRobot sets no speeds, and servos move.
 PHASE = eeprom("phase", 18, 1, 0, 254, PHASE_COUNTS_PER_S | PHASE_ZERO_IS_FASTEST)
 UNLOADING = eeprom("unloading", 19, 1, 0, 254, 0b101111)  # alarms that switch the motor off; assumed: all
 P_GAIN = eeprom("p_gain", 21, 1, 0, 254, 32)  # defaults of the gains: LeRobot, so101_follower.py
@@ -110,7 +110,7 @@ OVERLOAD_TORQUE = eeprom("overload_torque", 36, 1, 0, 254, 80)
 TORQUE_ENABLE = ram("torque_enable", 40, 1, 0, 1, 0)  # 2: damping, 128: this is the centre; neither is used here
 ACCELERATION = ram("acceleration", 41, 1, 0, 254, 0)  # 0: no limit
 GOAL_POSITION = ram("goal_position", 42, 2, -32767, 32767, 0, sign=15, unit=RAD_PER_COUNT)
-GOAL_TIME = ram("goal_time", 44, 2, -1000, 1000, 0, sign=10)  # in PWM mode the duty, in position mode unused
+GOAL_TIME = ram("goal_time", 44, 2, -1000, 1000, 0, sign=10)  # the duty in PWM mode; unused in position mode
 GOAL_SPEED = ram("goal_speed", 46, 2, -32767, 32767, FASTEST_COUNTS_PER_S, sign=15)
 TORQUE_LIMIT = ram("torque_limit", 48, 2, 0, 1000, 1000, unit=1 / LOAD_FULL_SCALE)
 LOCK = ram("lock", 55, 1, 0, 1, 1)
@@ -176,7 +176,7 @@ class StsServos(Servos):
         super().__init__(config, joints, drive)
 
     def failure(self, answer: Answer, what: str) -> Exception:
-        """Return SafetyStop, as the error byte holds alarms."""
+        """Return SafetyStop: the bits of the error byte are alarms."""
         del what
         return SafetyStop(
             f"servo {answer.servo_id} reports an alarm: {describe_alarms(answer.error)}",
@@ -184,7 +184,7 @@ class StsServos(Servos):
         )
 
     def prepare(self, joint: ServoJoint) -> None:
-        """Compare the homing offset with the calibration's, and read the phase, which the unit of speeds depends on."""
+        """Compare the homing offset with the calibration, and read the phase, which sets the unit of speeds."""
         servo_id, link = joint.servo_id, self.link
         offset = link.read(servo_id, HOMING_OFFSET)
         if joint.homing_offset not in (None, offset):
@@ -199,7 +199,7 @@ class StsServos(Servos):
         return speed_unit_rad_s(self._phases.get(servo_id, PHASE.default))
 
     def speed_count(self, servo_id: int, speed_rad_s: float) -> int:
-        """Return the count for the speed of a servo's setpoint: 0 means "stop" for some, and top speed for others."""
+        """Return the count for the speed of a servo's setpoint; 0 means "stop" on some servos, top speed on others."""
         fastest = 0 if self._phases.get(servo_id, PHASE.default) & PHASE_ZERO_IS_FASTEST else FASTEST_COUNTS_PER_S
         count = speed_rad_s / self.speed_unit(servo_id)
         return fastest if count > GOAL_SPEED.maximum else max(1, round(count))

@@ -13,9 +13,9 @@ from sim2real.errors import UsageError
 from sim2real.hardware.device import Device, Reading
 
 _POWER_OF_GEAR: Final = {"rad": 1, "rad/s": 1, "N m": -1, "V": 0, "A": 0, "1": 0, "N m/rad": -2, "N m s/rad": -2}
-"""Unit -> power of the gear in the ratio of the motor's value to the joint's: it turns faster, with less torque."""
+"""Unit -> n: the motor's value is gear ** n times the joint's, as the motor turns faster, with less torque."""
 _UNDIRECTED: Final = ("N m/rad", "N m s/rad")
-"""Units of gains, which are positive in both directions."""
+"""Units of gains, whose sign does not change with the direction."""
 
 
 T = TypeVar("T", "float", "np.ndarray")
@@ -26,9 +26,9 @@ class Joint:
     """A joint, and its mounting on the encoder of its motor.
 
     Attributes:
-        zero_rad: The encoder's angle, as the device reports it, at the joint's angle 0 [rad].
+        zero_rad: The encoder's angle at the joint's angle 0, as the device reports it [rad].
         direction: 1 where both turn the same way, -1 where they turn against each other.
-        gear: Turns of the encoder for one of the joint.
+        gear: Turns of the encoder for one turn of the joint.
     """
 
     name: str
@@ -38,7 +38,7 @@ class Joint:
 
     @classmethod
     def of(cls, joint: Joint | str) -> Joint:
-        """Return a joint; a name stands for one that turns with its encoder."""
+        """Return a joint; a name stands for a joint whose angle is its encoder's."""
         return joint if isinstance(joint, Joint) else cls(joint)
 
     def __post_init__(self) -> None:
@@ -73,14 +73,14 @@ class Joint:
 class Mounting:
     """The mountings of all joints of a device: converts commands and readings between joints and motors.
 
-    The unit of a command determines its conversion: angle, speed, torque, or drive of the motor (`V`, `A` or `1`),
-    whose sign alone changes. Gears count as lossless.
+    The unit of a command determines its conversion. Of voltages, currents and duties (`V`, `A`, `1`) only the sign
+    changes. Gears are assumed to be lossless.
 
     Attributes:
-        gear: Turns of each motor for one of its joint, ``(n,)``.
+        gear: Turns of each motor for one turn of its joint, ``(n,)``.
 
     Args:
-        joints: One per motor, in the device's order; none: each turns with its encoder.
+        joints: One per motor, in the device's order; none: joints have the angles of their encoders.
         device: The device; it need not be open.
 
     Raises:
@@ -113,20 +113,20 @@ class Mounting:
             self._factor, self._offset = self._factor[:, 0], self._offset[:, 0]
 
     def to_motors(self, command: np.ndarray) -> np.ndarray:
-        """Return the device's command for one of the joints, ``(n,)`` or ``(n, k)``."""
+        """Return the motors' command for a command of the joints, ``(n,)`` or ``(n, k)``."""
         return self._offset + self._factor * command
 
     def to_joints(self, command: np.ndarray) -> np.ndarray:
-        """Return the joints' command for one of the device, ``(n,)`` or ``(n, k)``."""
+        """Return the joints' command for a command of the motors, ``(n,)`` or ``(n, k)``."""
         return (command - self._offset) / self._factor
 
     def limits(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the lowest and the highest command of the joints between the device's, each ``(n,)`` or ``(n, k)``."""
+        """Return the joints' lowest and highest command for those of the motors, each ``(n,)`` or ``(n, k)``."""
         ends = self.to_joints(low), self.to_joints(high)
         return np.minimum(*ends), np.maximum(*ends)  # a direction of -1 swaps them
 
     def reading(self, reading: Reading) -> Reading:
-        """Return angles, speeds and loads of the joints for those of the motors."""
+        """Convert a reading of the motors to angles, speeds and loads of the joints."""
         return replace(
             reading,
             position_rad=(reading.position_rad - self._zero) / self._turns,
@@ -140,6 +140,6 @@ def _power(unit: str, what: str) -> int:
         raise UsageError(
             f"{what} in {unit!r} cannot be converted between motors and joints with a zero, a direction or a gear. "
             f"Units: {', '.join(_POWER_OF_GEAR)}",
-            hint="have the device convert them, and leave its joints plain",
+            hint="convert them in the device, and give its joints no zero, direction or gear",
         )
     return _POWER_OF_GEAR[unit]

@@ -1,4 +1,4 @@
-"""Devices and worlds by name: those of sim2real, and those of installed packages; to list them imports no module."""
+"""Devices and worlds by name, of sim2real and of installed packages; listing them imports no module."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ def available(group: str = DEVICES) -> dict[str, Any]:
 
 
 def load_device(name: str) -> Callable[..., Device]:
-    """Return what makes the device of a name, not opened yet: ``make(port, ids, drive, *, baud_rate, silence_s)``.
+    """Return the function that makes a device: ``make(port, ids, drive, *, baud_rate, silence_s)``.
 
-    ``port`` is its connection, such as a serial port's device file; ``ids`` are the motors' numbers, in the order of
-    the joints; ``drive`` has settings of a type that robot and device agree on; ``silence_s`` is the longest time
-    without an instruction while torque is on [s].
+    The device is not opened yet. ``port`` is its connection, such as the device file of a serial port; ``ids`` are the
+    motors' numbers, in the order of the joints; ``drive`` has the settings, of a type on which robot and device agree;
+    ``silence_s`` is the longest time without an instruction while torque is on [s].
 
     Raises:
-        UsageError: There is none of this name, or it cannot be imported.
+        UsageError: There is no device of this name, or it cannot be imported.
     """
     return load_entry("device", name, DEVICES, "hardware.registry.load_device")
 
@@ -49,8 +49,8 @@ def load_entry(what: str, name: str, group: str, contract: str) -> Callable[...,
     """Return the callable of an entry point.
 
     Args:
-        what: The noun for it in errors, e.g. ``device``.
-        contract: The protocol that it must satisfy, for the hint: a name in sim2real.
+        what: Noun for errors, e.g. ``device``.
+        contract: Where its protocol is defined, for the hint: a name in sim2real.
 
     Raises:
         UsageError: There is no entry of this name, or it cannot be imported or called.

@@ -27,8 +27,8 @@ from sim2real.worlds import rollouts as physics
 
 _NEEDED = ("open_loop", "fields", "start", "controls", "message")
 _ON_C, _COMPILED = (4, 24, 48, 128, 512), (32, 256, 1024)
-"""Numbers of copies in one call of a program, by engine; each number compiles a program. With a largest number of 512 for
-128, a Jacobian of 20 logs took 18 s of processor time for 24 s; compiled, 1,024 save a quarter of the time.
+"""Numbers of copies in one call of a program, on C and compiled; each number is a program. On C, a Jacobian of 20 logs
+took 24 s of processor time with at most 128 copies, 18 s with 512.
 """
 
 

@@ -24,16 +24,16 @@ _LOCK_TIMEOUT_S: Final = 0.5
 _SAFE_REPEATS: Final = 5
 _SAFE_PAUSE_S: Final = 0.002
 _FORCED_ATTEMPTS: Final = 5
-_MIN_LOSSES: Final = 3  # fewer missing answers in a long time mean that this process was not scheduled
-_BUSY_SHARE: Final = 0.3  # of a silence: if this thread was held up for longer, the computer is to blame
+_MIN_LOSSES: Final = 3  # fewer missing answers in a long silence mean that this process did not run
+_BUSY_SHARE: Final = 0.3  # share of a silence: if this thread did not run for longer, the computer is to blame
 _SCANNED: Final = 20
-_CONFIRMING_BYTES: Final = 17  # no other read is as long, so a late answer to another read cannot confirm
-_BARRIER_BYTES: Final = 18  # and more: the shortest read that only `_drain` makes
+_CONFIRMING_BYTES: Final = 17  # no other read is as long, so no late answer to another read counts as this one
+_BARRIER_BYTES: Final = 18  # the shortest read that only `_drain` makes; it makes longer ones, too
 
 
 @dataclass
 class _Silence:
-    """A time without answers: its begin and end, its missing answers, and for how long this thread did not run."""
+    """A time without answers: begin, end, number of missing answers, and for how long this thread did not run."""
 
     begin_ns: int
     end_ns: int
@@ -42,17 +42,17 @@ class _Silence:
 
 
 class ServoLink:
-    """Owner of port and lock. Every method may be called from any thread.
+    """A port with its lock. Every method may be called from any thread.
 
-    While `at_rest` is set, nothing that could move a motor leaves through here, neither "torque on" nor a goal: such an
-    instruction raises SafetyStop, also if it waits for the lock, or for the answer to its first attempt, when `at_rest`
-    is set.
+    While `at_rest` is set, no instruction that could move a motor is sent, neither "torque on" nor a goal: it raises
+    SafetyStop, even if `at_rest` is set while it waits for the lock or for the answer to its first attempt.
 
     Args:
-        failure: Returns the error that an answer to an instruction reports: SafetyStop if the servo has stopped itself.
+        failure: Returns the error to raise for an answer with an error byte: SafetyStop if the servo has stopped
+            itself.
 
     Attributes:
-        at_rest: Whether the torque was taken off and not switched on again.
+        at_rest: Whether the torque was taken off, and not switched on since.
         off_packet: The instruction that takes the torque of all servos off; no servo answers it.
 
     Raises:
@@ -66,13 +66,13 @@ class ServoLink:
         self.at_rest = False
         self.off_packet = b""
         self._failure = failure
-        # Counts of this session; the lock serialises transactions.
+        # Counts since the port was opened; the lock serialises transactions.
         self._transactions = self._retries = self._lost = self._late = 0
         self._late_us = array("i")
         self._lock = threading.Lock()
         self._parser = Parser(self.form)
         self._waiting: list[Packet] = []
-        self._unsettled = False  # whether an answer to a read is missing and may still come
+        self._unsettled = False  # whether the answer to a read is missing, and may still come
         self._drains = 0
         self._silence = _Silence(0, 0)
         self._is_silent = False
@@ -111,7 +111,7 @@ class ServoLink:
         return np.array(counts), transaction
 
     def write(self, servo_id: int, register: Register, value: int) -> Transaction:
-        """Write a register, and wait for the answer; some servos confirm a value that they refuse, see `set`."""
+        """Write a register, and wait for the answer. Some servos confirm values that they refuse: `set` reads back."""
         moves = self.family.moves(register, (value,))
         packet, what = self.form.write(servo_id, register, value), f"write of {value} to {register.name}"
         return self._exchange(packet, 0, (servo_id,), what, moves=moves)[1]
@@ -139,13 +139,13 @@ class ServoLink:
         self._exchange(packet, self.form.ping_bytes, (servo_id,), "ping", despite_error=True)
 
     def scan(self) -> list[int]:
-        """Return the ids below 20 that answer a ping of their own; a scan of all ids would take 2 s."""
+        """Ping each id below 20, and return those that answer; a scan of all ids would take 2 s."""
         ping, length = Instruction.PING, self.form.ping_bytes
         with self.hold():
             return [i for i in range(_SCANNED) if self._attempt(self.form.build(i, ping), (i,), length) is not None]
 
     def answering(self, packet: bytes, wait_s: float) -> list[int]:
-        """Send an instruction once; return the ids of the answers that come within ``wait_s``, in their order."""
+        """Send an instruction once; return the ids of all answers within ``wait_s``, in the order of arrival."""
         ids = []
         with self.hold():
             self._send(packet)
@@ -167,7 +167,7 @@ class ServoLink:
         return False
 
     def send_off(self) -> None:
-        """Take the torque of all servos off with one instruction, after the one that is on the wire. Never raises."""
+        """Take the torque of all servos off with one instruction, after a running transaction. Never raises."""
         with self._grabbed(), suppress(Exception):
             self._send(self.off_packet)
 
@@ -187,7 +187,7 @@ class ServoLink:
 
     @contextmanager
     def hold(self) -> Iterator[None]:
-        """Have exclusive use of the bus in the block; raise HardwareLost if it is closed."""
+        """Give the block exclusive use of the bus; raise HardwareLost if the bus is closed."""
         with self._lock:
             if self.closed:
                 raise HardwareLost(f"the bus on {self.config.port} is closed")
@@ -195,7 +195,7 @@ class ServoLink:
 
     @contextmanager
     def _grabbed(self) -> Iterator[None]:
-        """Have the bus in the block, after a while also without the lock: "off" matters more than a whole packet."""
+        """Give the block the bus, after a while even without the lock: "off" matters more than a whole packet."""
         held = self._lock.acquire(timeout=_LOCK_TIMEOUT_S)
         try:
             yield
@@ -218,7 +218,7 @@ class ServoLink:
             length: Number of data bytes of each answer.
             servo_ids: The servos that answer, in this order.
             despite_error: Whether errors in the answers are ignored.
-            moves: Whether it could move a motor, or switch a torque on.
+            moves: Whether the instruction could move a motor, or switch torque on.
 
         Raises:
             HardwareLost: There was no answer within the configured limits.
@@ -231,7 +231,7 @@ class ServoLink:
             request += f" of servo {servo_ids[0]}" if len(servo_ids) == 1 else f" of servos {tuple(servo_ids)}"
         with self.hold():
             began_ns = self.clock.now_ns()
-            # A bus that was lost just now is lost for the next instruction, too, after a single missing answer.
+            # If the bus was just lost, a single missing answer to the next instruction suffices.
             if not self._is_silent or began_ns - self._silence.end_ns > 1e9 * self.config.max_silence_s:
                 self._silence = _Silence(began_ns, began_ns)
             while (answers := self._try(packet, length, servo_ids, request, moves)) is None:
@@ -244,13 +244,13 @@ class ServoLink:
                 self._retries += 1
             now_ns = self.clock.now_ns()
             self._is_silent &= not servo_ids
-            # Count it, and by how much it was later than its bytes on the wire.
+            # Count the transaction, and how much later its answer was than its bytes on the wire.
             self._transactions += 1
             late_ns = max(0, now_ns - self._sent_ns - self._wire_ns(packet, servo_ids, length))
             self._late_us.append(min(late_ns // 1000, 1 << 30))
             self._late += late_ns > 1e9 * self.config.late_after_s
             transaction = Transaction(self._sent_ns, began_ns - requested_ns, now_ns - began_ns, losses, late_ns)
-        # Outside of the lock, as the error's cause is read from the servo.
+        # Outside of the lock, because the cause of the error is read from the servo.
         for answer in answers:
             if answer.error and not despite_error:
                 raise self._failure(answer, what)
@@ -260,14 +260,14 @@ class ServoLink:
         self, packet: bytes, length: int, servo_ids: Sequence[int], request: str, moves: bool
     ) -> list[Answer] | None:
         """Send an instruction once; return its answers, or None if one is missing."""
-        # Show the guardian that this process lives, as often as the bus is used.
+        # Each use of the bus shows the guardian that this process lives.
         if self.guardian is not None:
             self.guardian.beat()
-        # Checked with the lock: whoever takes the torque off gets it afterwards.
+        # Check while holding the lock: a thread that takes the torque off gets the lock only afterwards.
         if moves and self.at_rest:
             raise SafetyStop(f"no {request} is sent: the torque was taken off", hint="enable the device again")
         try:
-            # A write never waits for an empty line: it may take the torque off.
+            # A write does not wait until the line is quiet, because it may take the torque off.
             if length and self._unsettled and not self._drain(servo_ids[-1]):
                 return None
             answers = self._attempt(packet, servo_ids, length)
@@ -277,9 +277,9 @@ class ServoLink:
             self._require_watching()
             raise HardwareLost(f"{self.config.port} failed during {request}: {failure}") from failure
         finally:
-            # `make_safe` takes no lock: this instruction may have followed it, and some servos wake up at it.
+            # `make_safe` takes no lock: if this instruction came after it, it may have switched a servo on again.
             if moves and self.at_rest:
-                self._repeat_off(0.0)  # the line is quiet, and others wait for it
+                self._repeat_off(0.0)  # the line is quiet, and other threads wait for it
 
     def _repeat_off(self, pause_s: float) -> None:
         if not self.off_packet or self.closed:
@@ -291,13 +291,13 @@ class ServoLink:
                 self.port.write(self.off_packet)
 
     def _drain(self, servo_id: int) -> bool:
-        """Let answers that are late pass: read as many bytes as no other read; the line keeps the order.
+        """Discard late answers: send a read whose length no other read has; late answers arrive before its answer.
 
-        Taken for the answer to a repeated read, a late one would give its sample a time stamp that is 8 ms too late. To
+        A late answer that counts as the answer to a repeated read would make the sample's time stamp 8 ms too late. To
         wait until the line is quiet is not enough: an answer may be later than any such wait.
         """
-        # Ask the last servo that is read: those before it have answered by then. Each of these reads has another
-        # length: with two lengths in turn, answers that were 50 ms late ended later ones.
+        # Ask the last servo of a synchronised read: the others have answered by then. Each of these reads has another
+        # # length: with two alternating lengths, answers that were 50 ms late counted as later ones.
         self._drains += 1
         begin = self.family.torque.address
         length = _BARRIER_BYTES + self._drains % (self.family.size - begin - _BARRIER_BYTES + 1)
@@ -315,12 +315,12 @@ class ServoLink:
         end_ns = self._sent_ns + round(1e9 * self.config.reply_timeout_s) + self._wire_ns(packet, servo_ids, length)
         answers = []
         for i, servo_id in enumerate(servo_ids):
-            # A refusal has no data.
+            # An answer that refuses the instruction has no data.
             while (answer := self._next_answer(end_ns)) is not None:
                 fits = len(answer.data) == length or (not answer.data and answer.error & self.form.refusals)
                 if fits and answer.servo_id == servo_id:
                     break
-                # The answer of this servo is lost if the next one answers; any other answer is late.
+                # If a later servo answers, the answer of this servo is lost; any other answer is a late one.
                 self._late += not (fits and answer.servo_id in servo_ids[i + 1 :])
             if answer is None:
                 return None
@@ -343,7 +343,7 @@ class ServoLink:
                 if packet.intact and (answer := self.form.answer(packet)) is not None:
                     return answer
             if not (data := self.port.read(end_ns)):
-                # A thread that wakes up late did not get the processor.
+                # If this thread wakes up late, it did not get the processor.
                 self._silence.held_up_ns += max(0, self.clock.now_ns() - end_ns)
                 return None
             self._waiting += [packet for packet, _ in self._parser.feed(data)]
@@ -365,6 +365,6 @@ class ServoLink:
         raise HardwareLost(missed, hint=f"check power, cable, ids and baud rate{self.port.advice}")
 
     def _require_watching(self) -> None:
-        """Raise SafetyStop if the guardian has taken over: it reads answers that are then missing here."""
+        """Raise SafetyStop if the guardian has taken over: it then reads the answers that are missing here."""
         if self.guardian is not None:
             self.guardian.require_watching()

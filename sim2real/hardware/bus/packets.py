@@ -1,4 +1,4 @@
-"""Packets on a half-duplex bus of servos: the shared part, and the abstract part that each family defines."""
+"""Packets on a half-duplex bus of servos: shared code, and the abstract format that each family defines."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Packet:
 
 
 class Answer(NamedTuple):
-    """Content of a status packet: the servo, its error byte (0: no error), and the data that were read."""
+    """Content of a status packet: the servo, its error byte (0: no error), and the read data."""
 
     servo_id: int
     error: int
@@ -74,14 +74,14 @@ class PacketFormat(ABC):
 
     @abstractmethod
     def frame(self, servo_id: int, body: bytes) -> bytes:
-        """Return the bytes of a packet with a body, which is its code and its parameters."""
+        """Return the bytes of a packet whose body has the code and the parameters."""
 
     def build(self, servo_id: int, code: int, parameters: bytes = b"") -> bytes:
         """Return the bytes of a packet on the wire; arguments as in `Packet`."""
         return self.frame(servo_id, bytes((code,)) + parameters)
 
     def build_status(self, servo_id: int, error: int, parameters: bytes = b"") -> bytes:
-        """Return the bytes of a status packet, a servo's answer, with the error byte for the instruction."""
+        """Return the bytes of a status packet, the answer of a servo."""
         return self.build(servo_id, error, parameters)
 
     @abstractmethod
@@ -124,7 +124,7 @@ class PacketFormat(ABC):
         ]
 
     def word(self, data: bytes, position: int) -> int:
-        """Return the address, or the number of bytes, that begins at a position in a packet's parameters."""
+        """Return the address, or the number of bytes, that stands at a position in a packet's parameters."""
         return int.from_bytes(data[position : position + self.address_bytes], "little")
 
     def _word(self, value: int) -> bytes:
@@ -143,7 +143,7 @@ class Parser:
         self._buffer.clear()
 
     def feed(self, chunk: bytes) -> list[tuple[Packet, int]]:
-        """Return the packets that a chunk completes, each with the number of bytes of the chunk up to its end."""
+        """Return the packets that a chunk completes, each with the position of its end in the chunk [bytes]."""
         held_bytes = len(self._buffer)
         self._buffer += chunk
         taken_bytes = 0
@@ -168,13 +168,13 @@ class Parser:
         if len(buffer) < form.prefix_bytes:
             return None
         following = form.following(buffer)
-        if following is None:  # the header begins one byte later, if there is one
+        if following is None:  # the prefix is invalid: a header may begin one byte later
             return self._drop(1)
         end = form.prefix_bytes + following
         if len(buffer) < end:
             return None
         packet = form.parse(bytes(buffer[:end]))
-        # After a wrong checksum, drop the header only: the length may be wrong too, and include good packets.
+        # After a wrong checksum, drop only the header: the length may be wrong, too, and span good packets.
         return packet, self._drop(end if packet.intact else len(form.header))[1]
 
     def _drop(self, count: int) -> tuple[None, int]:

@@ -1,4 +1,4 @@
-"""The port of a bus of servos, and the time limits that hold on it."""
+"""The port of a bus of servos, and its time limits."""
 
 import os
 import select
@@ -20,7 +20,7 @@ class BusConfig:
     Args:
         port: Device file, e.g. /dev/ttyUSB0.
         reply_timeout_s: Longest wait for an answer, beyond the time of its bytes on the wire [s]. It must exceed the
-            latency timer of a USB adapter: 16 ms by default, better set it to 1 ms.
+            latency timer of the USB adapter, which is 16 ms by default; set that timer to 1 ms.
         max_silence_s: Time without any answer after which the bus counts as lost [s].
         late_after_s: Delay of an answer, beyond the time of its bytes on the wire, from which it counts as late: the
             time of its sample is then uncertain [s].
@@ -39,7 +39,7 @@ class BusConfig:
 
     @classmethod
     def patient(cls, port: str, baud_rate: int, silence_s: float) -> Self:
-        """Return limits with one time for both directions: a bus counts as lost when its host would count as dead."""
+        """Return limits with one time for both sides: a silent bus is lost, and a silent host dead, after it."""
         return cls(port, baud_rate, max_silence_s=max(cls.max_silence_s, silence_s), silence_s=silence_s)
 
     def __post_init__(self) -> None:
@@ -49,7 +49,7 @@ class BusConfig:
 
 
 Queries: TypeAlias = Sequence[tuple[bytes, Sequence[bytes]]]
-"""For each servo, the packet that reads its torque register, and the answers that mean "off"."""
+"""For each servo, the packet that reads its torque register, and the answers that mean "torque is off"."""
 CUT: Final = "cut the servos' power"
 _QUIET_NS, _LONGEST_ANSWER_NS = 2_000_000, 20_000_000
 
@@ -57,8 +57,8 @@ _QUIET_NS, _LONGEST_ANSWER_NS = 2_000_000, 20_000_000
 class Line(Protocol):
     """Bytes from and to a device, on the device's clock. Every method may be called from any thread.
 
-    `write` sends bytes without waiting. `read` returns the bytes that have arrived; none if there are none until a time
-    [ns]. Both raise OSError if the port is gone.
+    `write` sends bytes without waiting. `read` returns the bytes that have arrived, and waits for the first one until a
+    time [ns]. Both raise OSError if the port is gone.
     """
 
     @property
@@ -68,10 +68,10 @@ class Line(Protocol):
 
 
 class Port(Line, Protocol):
-    """A line that is open alone; `flush` drops the bytes that have arrived.
+    """A line with exclusive access; `flush` drops the bytes that have arrived.
 
     Attributes:
-        advice: What to look at if answers are missing or late, as the end of a hint.
+        advice: End of a hint: what to look at if answers are missing or late.
     """
 
     advice: str
@@ -101,13 +101,13 @@ class FdPort:
         os.write(self._fd, data)
 
     def read(self, until_ns: int) -> bytes:
-        # What has arrived counts, also if this thread did not run until after that time.
+        # Bytes that have arrived count, even if this thread did not run until after the time.
         left_s = max(0.0, (until_ns - self.clock.now_ns()) * 1e-9)
         if not select.select([self._fd], [], [], left_s)[0]:
             return b""
         try:
             data = os.read(self._fd, 4096)
-        except BlockingIOError:  # the other process has read it
+        except BlockingIOError:  # the other process has read the bytes
             return b""
         if not data:
             raise OSError("the port is ready to be read, but has no data: was it unplugged?")
@@ -124,7 +124,7 @@ class SerialPort(FdPort):
     advice = "; set a USB adapter's latency timer to 1 ms"
 
     def __init__(self, address: str, baud_rate: int) -> None:
-        # Imported here: neither training nor an emulated robot in this process needs it.
+        # Imported late: neither training nor an emulated robot needs pyserial.
         import serial
         from serial.tools import list_ports
 
@@ -134,7 +134,7 @@ class SerialPort(FdPort):
             ports = ", ".join(f"{p.device} ({p.description})" for p in list_ports.comports()) or "none"
             raise HardwareLost(
                 f"serial port {address} cannot be opened: {error}",
-                hint=f"serial ports here: {ports}; a port that is there but refused needs group 'dialout'",
+                hint=f"serial ports here: {ports}; if the port is listed, add your user to the group 'dialout'",
             ) from error
         super().__init__(cast(int, self._serial.fileno()))
 
@@ -145,11 +145,11 @@ class SerialPort(FdPort):
             raise OSError(str(error)) from error
 
     def close(self) -> None:
-        self._fd = -1  # the operating system gives the number to the next file that is opened
+        self._fd = -1  # the operating system reuses the number for the next opened file
         self._serial.close()
 
     def guardian(self, off: bytes, servos: Queries, silence_s: float, answer_s: float) -> Guardian:
-        """Start a guardian in a process of its own, which shares the open port: no other process gets it meanwhile."""
+        """Start a guardian in a separate process that shares the open port, so that no other process gets the port."""
         packets = [f"{query.hex()}:{','.join(answer.hex() for answer in answers)}" for query, answers in servos]
         arguments = [str(self._fd), repr(answer_s), off.hex(), *packets]
         place = f"{__name__}:guarded"
@@ -157,7 +157,7 @@ class SerialPort(FdPort):
 
 
 def guarded(fd: str, answer_s: str, off: str, *servos: str) -> Motors:
-    """Return the servos that a guardian's process watches; packets are hexadecimal, see `SerialPort.guardian`."""
+    """Return the servos for a guardian's process; packets are hexadecimal, see `SerialPort.guardian`."""
     packets = [text.partition(":") for text in servos]
     queries = [(bytes.fromhex(q), [bytes.fromhex(a) for a in answers.split(",")]) for q, _, answers in packets]
     port = FdPort(int(fd))
@@ -167,8 +167,8 @@ def guarded(fd: str, answer_s: str, off: str, *servos: str) -> Motors:
 def take_torque_off(port: Line, off: bytes, servos: Queries, answer_s: float) -> str:
     """Switch all servos off, repeatedly until each has confirmed it; return why one did not, else "".
 
-    Repeatedly, as the first packet is lost if the control process died while it was writing one, and as the control
-    process, if it resumes, may read an answer in place of this one. Arguments as in `Port.guardian`.
+    Once is not enough: the first packet is lost if the control process died while it was writing, and a control process
+    that resumes may read an answer before this process does. Arguments as in `Port.guardian`.
     """
     clock, unconfirmed = port.clock, list(servos)
     begin_ns = clock.now_ns()
@@ -204,7 +204,7 @@ def _confirms(port: Line, query: bytes, answers: Sequence[bytes], answer_s: floa
 
 
 EMULATED: Final[dict[str, Callable[[int], Port]]] = {}
-"""Address -> opens, at a baud rate, the port of an emulated robot in this process: `emulation`."""
+"""Address -> function that opens the port of an emulated robot in this process at a baud rate."""
 
 
 def open_port(address: str, baud_rate: int) -> Port:

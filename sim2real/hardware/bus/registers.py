@@ -1,4 +1,4 @@
-"""A family of servos as a table: the registers of their memory, their models, and what they expect at the start."""
+"""A family of servos as a table: registers, models, and settings that are written at the start."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -23,9 +23,9 @@ class Register:
         minimum: Smallest value that may be written [counts].
         maximum: Largest value that may be written [counts].
         default: Value after power-up [counts].
-        sign: Number of the sign bit beside a magnitude; or `TWOS_COMPLEMENT`; None: never negative.
+        sign: Number of the sign bit, if the other bits are a magnitude; or `TWOS_COMPLEMENT`; None: never negative.
         eeprom: Whether its value survives a loss of power.
-        unit: One count, in SI units.
+        unit: Value of one count, in SI units.
     """
 
     name: str
@@ -72,7 +72,7 @@ class ServoModel:
 
     Args:
         stops_alone: Whether it stops when its own bus watchdog trips; None: it has no watchdog.
-        source: Where that is documented, or who measured it.
+        source: Who documents or measured this.
     """
 
     name: str
@@ -91,17 +91,17 @@ class ServoModel:
 
 @dataclass(frozen=True)
 class Family:
-    """Servos with one packet format and one memory table. Driver and emulator are made of it.
+    """Servos with one packet format and one memory table, for driver and emulator.
 
     Args:
         name: Their name in messages.
-        named: The registers, e.g. the values of a module; values of other types are ignored.
+        named: The registers, e.g. a module's namespace; values of other types are ignored.
         size: Number of bytes of the memory.
-        baud_rates: Bits per second that they support.
+        baud_rates: Supported baud rates [bit/s].
         torque: Holds 0 while torque is off.
-        modes: Kind of command -> the value of `mode` with it, and the register of the command.
+        modes: Kind of command -> the value of the register `mode`, and the register of the command.
         goals: All registers that can move the motor while torque is on.
-        limits: The lowest and the highest position that they follow; both 0: no limit.
+        limits: Registers of the lowest and the highest position; both 0: no limit.
         mode: The operating mode.
         return_delay: Time between instruction and answer, in units of 2 us.
         controller: P gain, D gain, and speed of the setpoint.
@@ -109,13 +109,12 @@ class Family:
         voltage: The supply voltage, in units of 0.1 V.
         temperature: The motor's temperature [deg C].
         begin: Values that are written at `open`, such as "answer every instruction".
-        fixed: Values that are written before torque goes on, beside those of the controller.
-        watched: Groups of neighbouring registers that `check` compares with the values that were written, a read for
-            each.
+        fixed: Values that are written before torque goes on, in addition to those of the controller.
+        watched: Groups of neighbouring registers that `check` reads, and compares with the values that were written.
         full_rad: Position error times P gain at which the controller gives full torque [rad].
         models: Model number -> model.
-        watchdog: Longest silence of the host, after which their own watchdog trips and the register is below 0; 0: off;
-            None: they have none.
+        watchdog: Register with the longest silence of the host, after which the servo's own watchdog trips and the
+            register is below 0; 0: off; None: there is no watchdog.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Servos of any family on one bus, as a device, and every way in which their torque goes off."""
+"""Servos of any family on one bus, as a device."""
 
 import atexit
 import logging
@@ -29,12 +29,13 @@ from sim2real.hardware.device import (
 _LOGGER = logging.getLogger(__name__)
 _SHARED_PINGS: Final = 3
 _SLOW_RAD_S: Final = 0.5
-"""Speed that every servo reaches on a longer way, also under load [rad/s]."""
+"""Speed that every servo reaches on a long way, even under load [rad/s]."""
 _MOST_SHARE: Final = 0.9
-"""Share of its torque beyond which a servo that still does not reach its goal is stopped. With 0.7, 6 of 45 sound
-motions of an emulated SO-101 with payloads were stopped."""
+"""A servo that pushes with more than this share of its torque, and does not reach its goal, is stopped. With 0.7, 6 of
+45 faultless motions of an emulated SO-101 with payloads were stopped.
+"""
 _BEYOND_RAD: Final = 0.1
-"""Largest distance of a joint from its range when torque goes on [rad]; it is pulled back to the end of the range."""
+"""Largest distance of a joint from its range when torque goes on [rad]; torque pulls the joint back into the range."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +47,8 @@ class ServoJoint:
         direction: 1, or -1 if the joint's angle falls as the count rises.
         low_count: Lowest count of the joint's range; the servo's own limits may narrow it.
         high_count: Highest count.
-        homing_offset: Offset in the servo for which a calibration holds, checked at `open`, as are the servo's limits;
-            None: there is no calibration.
+        homing_offset: Homing offset that the servo had at the calibration; `open` compares it, and the limits, with the
+            servo; None: there is no calibration.
         counts: Counts of a revolution.
     """
 
@@ -71,7 +72,7 @@ class ServoJoint:
 
     @property
     def rad_per_count(self) -> float:
-        """Change of the angle with the count [rad]."""
+        """Change of the joint's angle from one count to the next [rad]."""
         return self.direction * 2.0 * math.pi / self.counts
 
     def angle(self, count: float) -> float:
@@ -81,14 +82,14 @@ class ServoJoint:
 
 @dataclass(frozen=True)
 class PositionDrive:
-    """Servos that follow goals of their joints [rad]; at rest they hold their positions.
+    """Servos that follow goals of their joints [rad]; at the start they hold their positions.
 
     Args:
         p_gain: P gain of every servo's position controller [counts].
-        speed_rad_s: Speed at which a servo's setpoint moves to its goal, at least a count; inf: the setpoint is the
-            goal.
+        speed_rad_s: Speed at which a servo's setpoint moves to its goal, at least one count; inf: the setpoint jumps to
+            the goal.
         d_gain: D gain [counts]. I gains are 0.
-        joints: The joints, e.g. from `read_calibration`; a servo without one gets a joint around the middle of a turn.
+        joints: The joints, e.g. from `read_calibration`; other servos get a joint whose zero is half a turn.
     """
 
     p_gain: int
@@ -104,7 +105,7 @@ class PositionDrive:
 
 @dataclass(frozen=True)
 class VoltageDrive:
-    """Servos that are commanded in volts, at rest 0 V. Angles are measured from each encoder's zero [rad].
+    """Servos that are commanded in volts, at the start 0 V. Angles are measured from each encoder's zero [rad].
 
     Args:
         supply_v: Voltage of a motor at full PWM [V].
@@ -125,9 +126,9 @@ class Servos(Device):
     its handler calls `make_safe`. If this process is killed or hangs, the guardian takes the torque off: a separate
     process that is started before torque goes on.
 
-    A subclass is a family: its table, and where it differs, `failure`, `model`, `prepare`, `speed_unit` and
-    `speed_count`. Servos may not report that they refuse a value, so every setting is read back; EEPROM registers are
-    written only if their value differs, as writing wears them out.
+    A subclass is a family: its table, and where the family differs, `failure`, `model`, `prepare`, `speed_unit` and
+    `speed_count`. Some servos refuse a value without an error, so every setting is read back. EEPROM registers are
+    written only if their value differs, because writing wears them out.
 
     Args:
         joints: The joints, or the ids of servos without a calibration.
@@ -138,7 +139,7 @@ class Servos(Device):
         halted: Whether torque stays off because `make_safe` or `close` was called.
 
     Raises:
-        UsageError: There are no joints, or two with one servo; or the family lacks that baud rate or watchdog.
+        UsageError: There are no joints, two have the same servo, or the family lacks this baud rate or watchdog time.
     """
 
     family: ClassVar[Family]
@@ -168,18 +169,18 @@ class Servos(Device):
         self.motors = tuple(f"servo {i}" for i in self.ids)
         if not self.ids or len(set(self.ids)) < len(self.ids) or not all(0 <= i < BROADCAST_ID for i in self.ids):
             raise UsageError(
-                f"servos {list(self.ids)}: there must be at least one, each with an id of its own, from 0 to "
+                f"servos {list(self.ids)}: there must be at least one, and each needs another id, from 0 to "
                 f"{BROADCAST_ID - 1}"
             )
         for register, value in self.settings(self.ids[0]).items():
             if not register.minimum <= value <= register.maximum:
                 raise UsageError(f"{register.name} = {value} is outside [{register.minimum}, {register.maximum}]")
-        # Built here, as make_safe must not need any time.
+        # Build the packet now, because make_safe must not take any time.
         self._off_packet = family.form.write_each(family.torque, dict.fromkeys(self.ids, 0))
         self.models: dict[int, ServoModel] = {}
         self.armed = self.halted = False
         self._link: ServoLink | None = None
-        # Counts of goals: zero, unit of the command, and range; `open` narrows it to the servos' own.
+        # For goals in counts: zero, unit of the command, and range, which `open` narrows to the servos' limits.
         self._at_zero = np.array([joint.zero_count for joint in self.joints])
         self._rad = np.array([joint.rad_per_count for joint in self.joints])
         self._zero, self._unit = self._at_zero, self._rad
@@ -188,7 +189,7 @@ class Servos(Device):
             self._zero = np.zeros(len(self.ids))
             self._unit = np.full(len(self.ids), drive.supply_v * self.goal.unit)
             self._low, self._high = self._zero + self.goal.minimum, self._zero + self.goal.maximum
-        # The registers of the state, in one block, and units of speed and load; `open` reads the servos' own of speed.
+        # The registers of the state, in one block, and units of speed and load; `open` corrects the units of speed.
         state = (family.position, family.velocity, family.load)
         self._state = sorted(state, key=lambda register: register.address)
         self._of_state = [self._state.index(register) for register in state]
@@ -198,18 +199,18 @@ class Servos(Device):
     # -- what differs between families
 
     def failure(self, answer: Answer, what: str) -> Exception:
-        """Return the error that an answer to the instruction ``what`` reports: SafetyStop if the servo has stopped."""
+        """Return the error to raise for an answer with an error: SafetyStop if the servo has stopped itself."""
         return SafetyStop(f"servo {answer.servo_id} reports the error {answer.error:#x} at the {what}")
 
     def model(self, servo_id: int, number: int) -> ServoModel:
-        """Return the model of a servo's number; raise HardwareLost for one that the table does not hold for."""
+        """Return the model of a servo; raise HardwareLost if the family's table does not describe it."""
         if number not in self.family.models:
             names = ", ".join(f"{model.name} ({n})" for n, model in self.family.models.items())
             raise HardwareLost(f"servo {servo_id} is model {number}, which is not supported. Available: {names}")
         return self.family.models[number]
 
     def prepare(self, joint: ServoJoint) -> None:
-        """Read or write what the settings depend on, with torque off."""
+        """Read or write registers on which the settings depend, with torque off."""
         del joint
 
     def speed_unit(self, servo_id: int) -> float:
@@ -218,7 +219,7 @@ class Servos(Device):
         return self.family.velocity.unit
 
     def speed_count(self, servo_id: int, speed_rad_s: float) -> int:
-        """Return the count for the speed of a servo's setpoint [rad/s]: 0 is unlimited, so none is rounded to it."""
+        """Return the count for the speed of a servo's setpoint: 0 means unlimited, so no speed is rounded to 0."""
         del servo_id
         return 0 if math.isinf(speed_rad_s) else max(1, self.family.controller[2].count(speed_rad_s))
 
@@ -285,7 +286,7 @@ class Servos(Device):
     def facts(self) -> dict[str, dict[str, str]]:
         link, family = self.link, self.family
         facts: dict[str, dict[str, str]] = {"firmware": {}, "voltage": {}, "temperature": {}}
-        # An error of a servo, such as an alarm, does not keep its facts from the log.
+        # Read the facts for the log even from a servo that reports an error, such as an alarm.
         for servo_id, motor in zip(self.ids, self.motors, strict=True):
             numbers = [link.read(servo_id, r, despite_error=True) for r in (*family.firmware, family.voltage)]
             facts["firmware"][motor] = ".".join(map(str, numbers[:-1]))
@@ -299,21 +300,21 @@ class Servos(Device):
         return np.minimum(*ends), np.maximum(*ends)  # a direction of -1 swaps them
 
     def following(self) -> Following | None:
-        """Return how joints follow their goals: near the limit, a servo pushes with nearly all of its torque."""
+        """Return how joints follow their goals: at the limit, a servo pushes with nearly all of its torque."""
         if isinstance(self.drive, VoltageDrive) or not self.drive.p_gain:
             return None
         speed_rad_s = min(_SLOW_RAD_S, 0.5 * self.drive.speed_rad_s)
         return Following(_MOST_SHARE * self.family.full_rad / self.drive.p_gain, RESPONSE_S, speed_rad_s)
 
     def enable(self) -> np.ndarray:
-        """Write settings, which a servo may have lost, and goals at rest, and switch the torque on."""
+        """Write the settings again, set goals at the present positions, and switch the torque on."""
         self.armed = False
         self._guard()
         link, family, goals = self.link, self.family, np.zeros(len(self.ids), np.int64)
         for i, joint in enumerate(self.joints):
             servo_id = joint.servo_id
-            # A tripped watchdog refuses goals, so it is cleared first and armed last. The goal comes before torque:
-            # some firmware switches it on at this write, and holds the position.
+            # A tripped watchdog refuses goals, so clear it first and arm it last. Goals come before torque: some
+            # firmware         # switches torque on at the goal's write, and holds the position.
             if family.watchdog is not None:
                 link.write(servo_id, family.watchdog, 0)
             self._write(servo_id, self.settings(servo_id))
@@ -321,7 +322,7 @@ class Servos(Device):
             link.set(servo_id, self.goal, int(goals[i]))
             link.write(servo_id, family.torque, 1)
             if family.watchdog is not None:
-                # Torque may set the goals to rest by itself.
+                # Some servos set their goals to the present positions when torque goes on.
                 link.write(servo_id, family.watchdog, self._watchdog_count)
         self.armed = True
         if link.at_rest:
@@ -340,7 +341,7 @@ class Servos(Device):
         )
 
     def command(self, values: np.ndarray) -> Transaction:
-        """Send goals ``(n,)`` [the unit of `commanded`]; one servo confirms its goal, several share one instruction.
+        """Send goals ``(n,)`` [the unit of `commanded`]; a single servo confirms, several get one instruction.
 
         Raises:
             SafetyStop: A goal is not finite or out of range, a servo has stopped itself, or torque is off.
@@ -359,9 +360,9 @@ class Servos(Device):
         return self.link.write_each(self.goal, dict(zip(self.ids, goals, strict=True)))
 
     def check(self) -> None:
-        """Raise SafetyStop if a servo's watchdog has tripped, or it has lost its settings, as by a restart.
+        """Raise SafetyStop if a servo's watchdog has tripped, or a servo has lost its settings in a restart.
 
-        Several servos do not confirm their common goals, and a restarted one takes goals with its torque off.
+        Goals for several servos are not confirmed, and a restarted servo accepts goals although its torque is off.
         """
         if not self.armed:
             return
@@ -373,7 +374,7 @@ class Servos(Device):
                 for register, current in zip(registers, row, strict=True):
                     if register is family.watchdog and current < 0:
                         raise self.tripped(servo_id)
-                    # `armed` may have changed: another thread took the torque off.
+                    # Another thread may have taken the torque off meanwhile.
                     if current != expected[register] and self.armed:
                         raise SafetyStop(
                             f"servo {servo_id} has lost its settings: {register.name} is {current}, not "
@@ -406,7 +407,7 @@ class Servos(Device):
         self.armed, link.at_rest = False, True
         guardian = link.guardian
         if guardian is not None and not guardian.settle():
-            guardian.disarm()  # it has taken over or died: take the torque off all the same
+            guardian.disarm()  # the guardian has taken over or died: take the torque off all the same
         if unconfirmed := self._release(self.ids):
             raise HardwareLost(
                 f"servos {unconfirmed} on {self.config.port} do not confirm that their torque is off",
@@ -418,11 +419,10 @@ class Servos(Device):
     def make_safe(self) -> None:
         """Take the torque off without a lock and without waiting for answers: for signal handlers and watchdog threads.
 
-        It takes no lock because the code that a signal interrupts may hold it. Torque cannot be switched on again
-        afterwards.
+        No lock, because the code that a signal interrupts may hold it. Torque cannot be switched on again afterwards.
         """
-        # In this order, as `_guard` in another thread allows motion and then looks for `halted`, and `enable` sets
-        # `armed` and then looks for `at_rest`.
+        # The order matters: `_guard`, in another thread, allows motion and then reads `halted`; `enable` sets `armed`
+        # # and then reads `at_rest`.
         self.halted = True
         if self._link is not None:
             self._link.at_rest = True
@@ -441,7 +441,7 @@ class Servos(Device):
         self.halted = True
         link.at_rest, self.armed = True, False
         guardian = link.guardian
-        # Let a guardian that takes the torque off finish, as both use the same line.
+        # If the guardian is taking the torque off, let it finish: both use the same line.
         if guardian is not None:
             guardian.settle()
         # Release every servo; the guardian continues with those that do not confirm.
@@ -453,7 +453,7 @@ class Servos(Device):
         atexit.unregister(self.close)
 
     def release(self, servo_id: int) -> bool:
-        """Take a servo's torque off, then its watchdog; return whether it has confirmed. Never raises."""
+        """Switch a servo's torque off, then its watchdog; return whether it has confirmed. Never raises."""
         family = self.family
         confirmed = self.link.force(servo_id, family.torque, 0)
         if confirmed and family.watchdog is not None:
@@ -461,7 +461,7 @@ class Servos(Device):
         return confirmed
 
     def _release(self, servo_ids: Iterable[int]) -> list[int]:
-        """Take the torque of all servos off at once; return those that do not confirm it. Never raises."""
+        """Take the torque of all servos off at once; return the servos that do not confirm. Never raises."""
         self.link.send_off()
         return [servo_id for servo_id in servo_ids if not self.release(servo_id)]
 
@@ -496,23 +496,23 @@ class Servos(Device):
                 hint=f"check power, cable, id and baud rate{link.port.advice}; two servos of one id garble each "
                 "other's answers: connect one at a time",
             ) from error
-        # Ping several times for a second servo of the same id: a late answer to an earlier ping does not repeat.
+        # Two servos of one id answer every ping twice; a late answer to an earlier ping comes only once.
         ping, wait_s = link.form.build(servo_id, Instruction.PING), 2.0 * self.config.reply_timeout_s
         if all(link.answering(ping, wait_s).count(servo_id) > 1 for _ in range(_SHARED_PINGS)):
             raise HardwareLost(
                 f"two servos on {self.config.port} have the id {servo_id}{whose}: both answer, and both would obey",
-                hint="connect one of them at a time, and give each an id of its own",
+                hint="connect one of them at a time, and give each another id",
             )
         self.models[servo_id] = self.model(servo_id, link.read(servo_id, self.family.model_number, True))
 
     def _narrow(self, joint: ServoJoint) -> None:
-        """Keep goals within the servo's own limits, which must hold a calibrated joint's whole range."""
+        """Narrow goals to the servo's own limits, which must contain the whole range of a calibrated joint."""
         low, high = (self.link.read(joint.servo_id, register) for register in self.family.limits)
         if isinstance(self.drive, VoltageDrive) or (low, high) == (0, 0):
             return
         if joint.homing_offset is not None and not low <= joint.low_count < joint.high_count <= high:
             raise HardwareLost(
-                f"servo {joint.servo_id} (joint {joint.name!r}) goes from {low} to {high} counts only, its joint from "
+                f"servo {joint.servo_id} (joint {joint.name!r}) accepts {low} to {high} counts only, its joint needs "
                 f"{joint.low_count} to {joint.high_count}",
                 hint="calibrate again, or narrow the joint's range",
             )
@@ -524,7 +524,7 @@ class Servos(Device):
             self.link.set(servo_id, register, value)
 
     def _goal_at_rest(self, i: int) -> int:
-        """Return the goal that keeps a joint at rest; raise SafetyStop if it is far outside its range."""
+        """Return the goal that holds a joint where it is; raise SafetyStop if it is far outside its range."""
         if isinstance(self.drive, VoltageDrive):
             return 0
         joint, low, high = self.joints[i], int(self._low[i]), int(self._high[i])

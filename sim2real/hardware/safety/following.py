@@ -1,4 +1,4 @@
-"""Following error: a joint that does not do what its commands say has let go, is blocked, slips, or reads wrongly."""
+"""Following error: stops the robot if a joint does not follow its commands, because it let go, is blocked, or slips."""
 
 from __future__ import annotations
 
@@ -17,19 +17,21 @@ _BEYOND_S: Final = 0.04
 _SAMPLES: Final = 3
 """Number of samples in a row that must be beyond the limit."""
 _PARTS: Final = 10
-"""Parts of the time between two measurements for which the command is looked up."""
+"""Number of times between two measurements at which the command is looked up."""
 _SLOW_RAD_S: Final = 0.5
 _LONGEST_S: Final = 0.05
-"""Between two measurements farther apart, as of a host that was held up, forces change too much to tell a push [s]."""
+"""Longest time between two measurements whose change of speed is compared: over a longer time, forces change too much
+[s].
+"""
 _UNSURE: Final = 0.15
-"""Share of the time between two measurements by which their times, or those of commands, may be uncertain."""
+"""Largest uncertainty of the times of measurements and commands, as a share of the time between two measurements."""
 _ENOUGH: Final = 3.0
-"""Sum of the squares of a joint's changes of speed from which on they tell, against noise of 0.05 rad/s [rad^2/s^2]."""
+"""Smallest sum of squares of a joint's changes of speed that is compared; noise is 0.05 rad/s [rad^2/s^2]."""
 
 
 @dataclass
 class _Sent:
-    """A command; between its two times it began to act. While it is being sent, the second one is not known."""
+    """A command, which began to act between two times; the second is unknown while the command is being sent."""
 
     command: np.ndarray
     begin_s: float
@@ -49,7 +51,7 @@ class _Sample:
 
 
 class _Goals:
-    """The distance of each joint from where its goals put it [rad]."""
+    """Computes the distance of each joint from where its goals put it [rad]."""
 
     def __init__(self, following: Following, start: np.ndarray) -> None:
         self._following = following
@@ -60,7 +62,7 @@ class _Goals:
 
     def off(self, commands: Sequence[_Sent], now: _Sample) -> np.ndarray:
         goals, position_rad = np.array([sent.command for sent in commands]), now.position_rad
-        # A joint that is on its way to its goals goes on from where it was measured last.
+        # A joint on its way to its goals moves on from its last measured position.
         downwards, upwards = self._speeds(self._position)
         self._low = np.minimum(goals.min(axis=0), np.maximum(self._low, self._position) + upwards * now.elapsed_s)
         self._high = np.maximum(goals.max(axis=0), np.minimum(self._high, self._position) - downwards * now.elapsed_s)
@@ -82,14 +84,14 @@ class _Goals:
 
 
 class _Torques:
-    """By how much the load of each motor is weaker than its law, on average [N m]."""
+    """Computes by how much the load of each motor is weaker than its commanded torque, on average [N m]."""
 
     def __init__(self, following: Following, start: np.ndarray) -> None:
         self._following = following
         self._weak, self._law = np.zeros(len(start)), np.zeros(len(start))
 
     def off(self, commands: Sequence[_Sent], now: _Sample) -> np.ndarray:
-        # The robot obeys the last command that was sent, or one that is being sent.
+        # The robot may obey the last command or the one that is being sent.
         after = [*commands[1:], None]
         laws = [c.command for c, then in zip(commands, after, strict=True) if then is None or then.end_s > now.t_s]
         most = np.asarray(self._following.most_nm, np.float64)
@@ -109,7 +111,7 @@ class _Torques:
 
 
 class _Pushes:
-    """Which share of the acceleration by its commands each joint lacks."""
+    """Computes which share of the acceleration due to its commands each joint lacks."""
 
     def __init__(self, following: Following, start: np.ndarray) -> None:
         self._following, self._none = following, np.zeros(len(start))
@@ -129,10 +131,10 @@ class _Pushes:
         return np.where(squares > _ENOUGH, 1.0 - products / np.maximum(squares, _ENOUGH), 0.0)
 
     def _compare(self, commands: Sequence[_Sent], now: _Sample, before: np.ndarray, unsure_s: float) -> None:
-        """Compare the change of speed since the last measurement with that by the commands, if times are certain."""
+        """Compare the change of speed since the last measurement with the commands, if times are certain."""
         following, elapsed_s = self._following, now.elapsed_s
         assert following.push is not None
-        # The commands that acted since then, on average.
+        # The average of the commands that acted since the last measurement.
         ends_s = now.t_s - following.delay_s - elapsed_s * np.linspace(1.0, 0.0, _PARTS, endpoint=False)
         begins_s = np.array([sent.begin_s for sent in commands])
         places = np.maximum(np.searchsorted(begins_s, ends_s, "right") - 1, 0)
@@ -145,7 +147,7 @@ class _Pushes:
         acted = np.array([commands[i].command for i in places]).mean(axis=0)
         speed = 0.5 * (now.velocity_rad_s + before)
         free, pushed, friction = following.push(now.position_rad - 0.5 * elapsed_s * speed, speed, acted)
-        # A joint that is slow may be held by its friction, unless it is pushed much harder.
+        # Friction may hold a slow joint, unless its command pushes much harder.
         moves = (np.abs(speed) > _SLOW_RAD_S) | (np.abs(free + pushed) > 3.0 * friction)
         by_command = np.where(moves, elapsed_s * pushed, 0.0)
         answer = now.velocity_rad_s - before - elapsed_s * free
@@ -158,11 +160,12 @@ class _Pushes:
 class FollowingCheck:
     """Compares measurements with commands; see `Following`. Both may come from different threads.
 
-    A host that is held up does not look like a joint that lets go: a command counts as obeyed only after it was sent,
-    and pushes are compared over times that are certain.
+    A host that did not run for a while causes no false alarm: a command counts only after it was sent, and pushes are
+    compared only if the times are certain.
 
     Args:
-        start: Command that the joints follow at the start, ``(n,)`` [rad], or ``(n, 5)`` as in `Following`.
+        start: Command that the joints follow at the start, ``(n,)``, or ``(n, 5)`` with the columns of `Following`'s
+            torque.
         t_s: Time of the start [s].
         name: Returns a joint's name for errors.
     """
@@ -176,7 +179,7 @@ class FollowingCheck:
         self._lock = threading.Lock()
         self._commands = [_Sent(first, t_s, t_s)]
         self._t_s = t_s
-        # Since when each joint is beyond its limit, and for how many samples.
+        # Since when, and for how many samples, each joint has been beyond its limit.
         self._since_s, self._count = np.zeros(n), np.zeros(n, np.int64)
 
     def sending(self, command: np.ndarray, t_s: float) -> None:
@@ -196,13 +199,13 @@ class FollowingCheck:
 
         Args:
             t_s: Its time [s].
-            unsure_s: By how much later it may have been taken [s].
+            unsure_s: By how much later than ``t_s`` it may have been taken [s].
 
         Raises:
             SafetyStop: A joint does not follow its commands.
         """
         with self._lock:
-            # Keep the commands of the response's time, and the one before.
+            # Keep the commands of the last `response_s`, and the one before.
             commands = self._commands
             while len(commands) > 1 and commands[1].end_s <= t_s - self._following.response_s:
                 commands.pop(0)

@@ -1,7 +1,6 @@
 """The safety gate: its limits, and the check of every command before it is sent to the motors.
 
-`GateLimits` are the flags of the stages that move a robot; numpy is imported when it is used, for which --help need not
-wait.
+`GateLimits` are the flags of the stages that move a robot; numpy is imported late, to keep --help fast.
 """
 
 from __future__ import annotations
@@ -44,13 +43,13 @@ class GateLimits:
     slew_per_s: float = 400.0
     """Largest rate of change of a command [the actuator's unit per second]."""
     command_timeout_s: float = 0.1
-    """Age from which a command is replaced, by zero volts or, in position mode, by the last one (servos hold) [s]."""
+    """A command older than this is replaced: by zero volts, or in position mode by the last goal [s]."""
     max_speed_rad_s: float = 60.0
-    """Joint speed above which the robot is stopped, whether measured or computed from successive positions [rad/s]."""
+    """Joint speed above which the robot is stopped, measured or from successive positions [rad/s]."""
     freeze_rad_s: float = 2.0
     """A joint that moved this fast and then reads the same for 0.05 s stops the robot: its encoder froze [rad/s]."""
     envelope_rad: tuple[float, float] | None = None
-    """Range of joint angles, lowest and highest; outside of it the robot is stopped; default: not checked [rad]."""
+    """Lowest and highest joint angle, beyond which the robot is stopped; default: not checked [rad]."""
     first_step_rad: float = 0.5
     """Largest distance of the first goal from the measured pose; a policy that starts farther away is refused [rad]."""
     following_rad: float | None = None
@@ -59,7 +58,7 @@ class GateLimits:
     max_sample_age_s: float = 0.25
     """Age of the newest measurement above which the robot is stopped instead of commanded [s]."""
     stop_s: float = 0.5
-    """Longest time in which the first Ctrl-C brings the robot to rest before the torque goes off [s]."""
+    """Longest time in which Ctrl-C brings the robot to rest before the torque goes off [s]."""
     servo_watchdog_s: float = 0.1
     """Longest silence on the bus; after it the guardian takes the torque off, and the servos' watchdogs trip [s]."""
 
@@ -85,7 +84,7 @@ class GateLimits:
 
 @dataclass(frozen=True)
 class GateConfig(GateLimits):
-    """The limits of one robot's commands and measurements; those of `GateLimits`, which may differ between joints.
+    """The limits of one robot's commands and measurements: `GateLimits`, with values per joint.
 
     Args:
         limit: Largest magnitude of a command, or (low, high), each one value or one per actuator [the command's unit];
@@ -107,7 +106,7 @@ class GateConfig(GateLimits):
     freeze_s: float = 0.05
 
     def __post_init__(self) -> None:
-        # A gate that refuses every command, or the one at rest, would stop the robot at once.
+        # A gate that refuses every command, or the command at rest, would stop the robot at once.
         low, high = self.range
         if low.ndim > 1 + self.has_columns or (low.ndim and high.ndim and low.shape != high.shape):
             raise self._wrong(f"limit {self.limit} has another number of lows than of highs")
@@ -165,13 +164,13 @@ class GateConfig(GateLimits):
         return replaced
 
     def pushes(self, sent: np.ndarray) -> np.ndarray:
-        """Return which joints a command pushes, ``(n,)``: it holds a position, or differs from the one at rest."""
+        """Return which joints a command pushes, ``(n,)``: it is a position, or differs from the command at rest."""
         return (sent != self.at_rest(sent)).reshape(len(sent), -1).any(axis=1) | (self.stale == "hold")
 
 
 @dataclass
 class GateCounts:
-    """Counts of the calls of the gate, and of those in which each limit changed a command.
+    """Counts of the gate's calls, and of the calls in which each limit changed a command.
 
     Attributes:
         passed: Calls that returned a command.
@@ -198,8 +197,8 @@ class SafetyGate:
         """Start again, with counts at zero and no stop.
 
         Args:
-            start: Shape (n,) or (n, k): the command that the robot follows now, where the slew limit starts; it may be
-                outside the limits. None: zero, not allowed if stale commands are replaced by the last one.
+            start: Shape (n,) or (n, k): the command that the robot follows now, from which the slew limit starts; it
+                may be outside the limits. None: zero, not allowed if stale commands are replaced by the last one.
         """
         self.counts = GateCounts()
         self._last = None if start is None else np.array(start, dtype=np.float64, ndmin=1)
@@ -246,7 +245,7 @@ class SafetyGate:
             self._last = np.zeros_like(wanted)
         fallback = self.fallback
         self._require_shape(wanted)
-        # Replace a stale command, or limit a fresh one; the comparison also catches an age of NaN.
+        # Replace a stale command, also one with an age of NaN, or limit a fresh one.
         if not age_s <= self.config.command_timeout_s:
             self.counts.stale += 1
             allowed = fallback
@@ -264,7 +263,7 @@ class SafetyGate:
             return wanted
         elapsed_s = 0.0 if self._last_s is None else max(0.0, now_s - self._last_s)
         if self.config.holds:
-            # The robot held its position meanwhile: a long pause must not allow a large jump.
+            # The robot held its position in a pause, so a long pause must not allow a large jump.
             elapsed_s = min(elapsed_s, self.config.command_timeout_s)
         limit = np.asarray(self.config.slew_per_s, np.float64)
         # Infinite times 0 s is NaN; it means no limit.

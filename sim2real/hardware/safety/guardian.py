@@ -2,8 +2,9 @@
 
     python -P -m sim2real.hardware.safety.guardian LINK_FD SILENCE_S MODULE:FUNCTION [ARGUMENT ...]
 
-``FUNCTION(*arguments)`` returns the `Motors`. The process runs before torque goes on, has all that it needs open, and
-touches the motors only when the control process no longer does. `Guard` is that side, `Guardian` the control process's.
+``FUNCTION(*arguments)`` returns the `Motors`. The process starts before torque goes on, opens everything it needs, and
+touches the motors only when the control process no longer does. `Guard` runs in this process, `Guardian` in the control
+process.
 """
 
 import importlib
@@ -27,14 +28,14 @@ from sim2real.hardware.clock import SYSTEM_CLOCK, Clock
 READY, BEAT, REST, LEAVE, TRIP = b"r", b"+", b"-", b"q", b"!"
 TRIPPED, SAFE, FAILED = b"t", b"s", b"f"
 GIVE_UP_S = 10.0
-"""Longest time for which motors that do not confirm are asked again [s]."""
-PRIORITY: Final = 3  # above the threads that it watches, which have 1: should one never rest, this must not wait for it
+"""Time for which motors that do not confirm "torque off" are asked again [s]."""
+PRIORITY: Final = 3  # above the watched threads, which have 1: if one never sleeps, this process must not wait for it
 _PR_SET_PDEATHSIG: Final = 1  # of <sys/prctl.h>
 _START_TIMEOUT_S: Final = 10.0
 _SETTLE_TIMEOUT_S: Final = 1.0
 _KILL_S: Final = 0.01
-_BEATS: Final = 10  # number of signs of life in the longest silence
-_INTERVAL_S: Final = 0.01  # between signs of life if silence is not limited
+_BEATS: Final = 10  # signs of life per longest silence
+_INTERVAL_S: Final = 0.01  # between signs of life, if silence is not limited
 _DEAD: Final = "the guardian has died: the torque would stay on if this process died too"
 
 
@@ -43,9 +44,9 @@ class Motors:
     """Motors that a guardian watches.
 
     Attributes:
-        take_torque_off: Makes them safe and takes their torque off; returns why they did not confirm it, else "".
-        cut: The advice to a person if they do not.
-        at_rest: Whether the death of the control process counts while the torque is off, too.
+        take_torque_off: Makes the motors safe and takes their torque off; returns why they did not confirm, else "".
+        cut: Advice to a person if they do not confirm.
+        at_rest: Whether the guardian also acts if the control process dies while the torque is off.
         close: Called when the guardian ends.
     """
 
@@ -57,7 +58,7 @@ class Motors:
 
 
 class Guard:
-    """Decides when the motors are made safe; `watch` runs it in a process, `hear` and `look` are its steps.
+    """Decides when the motors are made safe; `watch` is the loop of its process, `hear` and `look` are its steps.
 
     Args:
         silence_s: Longest time without a sign of life while torque is on [s]; 0: unlimited.
@@ -73,16 +74,16 @@ class Guard:
         say(READY)
 
     def watch(self, link: int) -> None:
-        """Act until the control process ends it, or dies."""
+        """Run until the control process ends the guardian, or dies."""
         going = True
         while going:
             due_s = self.due_s()
             wait_s = None if due_s is None else max(0.0, due_s - self._now_s())
-            # Messages first: this process may be late itself.
+            # Read messages first: this process may be late itself.
             if not select.select([link], [], [], wait_s)[0]:
                 self.look()
                 continue
-            messages = b""  # as of a control process that has died
+            messages = b""  # the control process has died
             with suppress(OSError):
                 messages = os.read(link, 4096)
             going = self.hear(messages)
@@ -96,11 +97,11 @@ class Guard:
         """Make the motors safe if the control process has been silent for too long."""
         due_s = self.due_s()
         if due_s is not None and self._now_s() >= due_s:
-            # Stay until the control process leaves: it may resume, and switch torque on before it notices.
+            # Stay until the control process ends: it may resume, and switch torque on before it reads the message.
             self._trip(f"the control process was silent for {self._silence_s:.2f} s")
 
     def hear(self, messages: bytes) -> bool:
-        """Process messages of the control process; none: it has died. Return whether to go on."""
+        """Process messages of the control process; empty if it has died. Return whether to go on."""
         if not messages and (self._armed or self._motors.at_rest):
             self._make_safe("the control process is gone")
         if not messages or messages.endswith(LEAVE):
@@ -137,14 +138,13 @@ def main(link_fd: str, silence_s: str, place: str, *arguments: str) -> None:
     """Run until the control process ends."""
     module, _, name = place.partition(":")
     motors: Motors = getattr(importlib.import_module(module), name)(*arguments)
-    # Ignore what a terminal and a service manager send; this ends when the control process does.
+    # Ignore the signals of a terminal and a service manager: this process ends with the control process.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
-    # On a busy machine this process, which is almost always idle, must not wait. Threads that a connection has begun
-    # keep their priority.
+    # On a busy machine this process must not wait. Threads that a connection has started keep their priority.
     with suppress(AttributeError, OSError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
-    # Should this process be stopped, as by a debugger, the kernel continues it when the control process dies (Linux).
+    # If this process is stopped, e.g. by a debugger, Linux continues it when the control process dies.
     with suppress(ImportError, OSError, AttributeError):
         import ctypes
 
@@ -152,7 +152,7 @@ def main(link_fd: str, silence_s: str, place: str, *arguments: str) -> None:
     link, stderr = int(link_fd), 2
 
     def write(fd: int, message: bytes) -> None:
-        with suppress(OSError):  # the control process or the terminal may not exist any more
+        with suppress(OSError):  # the control process or the terminal may be gone
             os.write(fd, message)
 
     Guard(motors, float(silence_s), partial(write, link), lambda text: write(stderr, f"{text}\n".encode())).watch(link)
@@ -162,9 +162,9 @@ def main(link_fd: str, silence_s: str, place: str, *arguments: str) -> None:
 class Channel(Protocol):
     """The control process's end of the connection to a guardian.
 
-    `send` does not wait; it raises OSError if the guardian has died, or does not read. `receive` returns messages, None
-    if none come until a time [ns], or b"" if the guardian has died. `close` closes the connection, waits for the
-    guardian's end, and kills it after a time [s]; 0: it does not wait.
+    `send` does not wait; it raises OSError if the guardian has died, or does not read. `receive` waits for messages
+    until a time [ns]; it returns None if none come, and b"" if the guardian has died. `close` closes the connection,
+    waits for the guardian's end, and kills it after a time [s]; 0: no wait.
     """
 
     clock: Clock
@@ -175,7 +175,7 @@ class Channel(Protocol):
 
 
 class Process:
-    """A guardian's process, which shares a socket with this one; a `Channel`.
+    """The guardian's process, connected to this one by a socket; a `Channel`.
 
     Args:
         place: ``MODULE:FUNCTION`` that returns the `Motors`.
@@ -237,10 +237,10 @@ class Process:
 class Guardian:
     """The control process's side: starts a guardian, sends it signs of life, and reads its messages.
 
-    A guardian that died is noticed at the next sign of life, which costs 10 us. It reports its actions on stderr.
+    The next sign of life, which takes 10 us, notices a guardian that died. The guardian reports its actions on stderr.
 
     Args:
-        start: Starts it, given the longest silence [s].
+        start: Starts the process, given the longest silence [s].
         silence_s: Longest time without a sign of life while torque is on [s]; 0: unlimited, only this process' death
             counts.
         settle_s: Longest time until the motors are in the safe state [s].
@@ -256,9 +256,9 @@ class Guardian:
         self._interval_s = silence_s / _BEATS or _INTERVAL_S
         self._beat_s = -math.inf
         self._armed = self._tripped = False
-        self._lock = threading.RLock()  # reentrant, as a signal handler may close the bus in the middle of `beat`
+        self._lock = threading.RLock()  # reentrant, because a signal handler may close the bus in the middle of `beat`
         self._messages = b""
-        # Signs of life are one interval apart. Torque may go on only once it watches.
+        # Signs of life are one interval apart. Torque may go on only once the guardian watches.
         self._channel = start(silence_s + self._interval_s if silence_s else 0.0)
         if not self._hears(READY, _START_TIMEOUT_S):
             self._channel.close(_KILL_S)
@@ -267,7 +267,7 @@ class Guardian:
 
     @property
     def took_over(self) -> bool:
-        """Whether it has made the motors safe, or was about to."""
+        """Whether it has made the motors safe, or has begun to."""
         return bool(self._messages) or self._tripped
 
     def arm(self) -> None:
@@ -281,8 +281,9 @@ class Guardian:
             raise
 
     def disarm(self) -> None:
-        """Let it no longer watch for silence, as torque is off. Never raises; if it has died, the next `arm` raises."""
-        with self._lock, suppress(SafetyStop):  # locked, as a sign of life sent after this message would arm it again
+        """End the watch for silence, as torque is off. Never raises; if the guardian died, the next `arm` raises."""
+        # Locked, because a sign of life after this message would arm the guardian again.
+        with self._lock, suppress(SafetyStop):
             self._armed = False
             self._send(REST)
 
@@ -297,7 +298,7 @@ class Guardian:
             if not self._armed or (not self._messages and now_s - self._beat_s < self._interval_s):
                 return
             self._beat_s = now_s
-            # Any message means that it has taken over; without one, show it that this process lives.
+            # Any message means that the guardian has taken over; without one, send a sign of life.
             self._listen()
             if not self._messages:
                 self._send(BEAT)
@@ -308,24 +309,24 @@ class Guardian:
         )
 
     def require_watching(self) -> None:
-        """Raise SafetyStop as `beat` does, also when no sign of life is due: called when the bus seems lost.
+        """Raise SafetyStop as `beat` does, even when no sign of life is due.
 
-        A guardian that takes over reads the servos' answers, which are then missing here.
+        Called when the bus seems lost: a guardian that takes over reads the answers that are missing here.
         """
         self._beat_s = -math.inf
         self.beat()
 
     def trip(self) -> None:
-        """Let it make the motors safe now. Without a lock, for signal handlers; never raises."""
+        """Let the guardian make the motors safe now. Takes no lock, for signal handlers; never raises."""
         self._tripped = True
         with suppress(OSError):  # it has died, or does not read
             self._channel.send(TRIP)
 
     def settle(self) -> bool:
-        """Wait until the motors are in the safe state, if it is making them safe. Never raises.
+        """If the guardian is making the motors safe, wait until they are. Never raises.
 
         Returns:
-            Whether it still watches: it has neither taken over nor died.
+            Whether the guardian still watches: it has neither taken over nor died.
         """
         try:
             with self._lock:
@@ -340,7 +341,8 @@ class Guardian:
         """End the guardian. Never raises.
 
         Args:
-            confirmed: Whether all motors have confirmed that their torque is off; if not, it tries for another 10 s.
+            confirmed: Whether all motors have confirmed that their torque is off; if not, the guardian tries for
+                another 10 s.
         """
         if confirmed:
             with suppress(SafetyStop):
@@ -354,7 +356,7 @@ class Guardian:
             raise SafetyStop(_DEAD, hint="start again") from error
 
     def _listen(self, until_ns: int = 0) -> bool:
-        """Read the guardian's messages, waiting until a time [ns]; return whether there were any; raise if it died."""
+        """Wait for the guardian's messages until a time [ns]; return whether one came; raise if it has died."""
         heard = False
         while (received := self._channel.receive(0 if heard else until_ns)) is not None:
             if not received:
@@ -364,7 +366,7 @@ class Guardian:
         return heard
 
     def _hears(self, message: bytes, timeout_s: float) -> bool:
-        """Wait for a message; return False after the timeout, a report of failure, or the guardian's death."""
+        """Wait for a message; return False after a timeout, a report of failure, or the guardian's death."""
         end_ns = self._channel.clock.now_ns() + round(1e9 * timeout_s)
         with suppress(SafetyStop):
             while message not in self._messages and FAILED not in self._messages:

@@ -10,13 +10,13 @@ from sim2real.hardware.safety.gate import GateConfig
 from sim2real.leaps import STAMP_S, reach_rad
 
 _SAMPLES = 3
-"""Number of readings in a row that must be the same before an encoder counts as frozen."""
+"""Number of equal readings in a row after which an encoder counts as frozen."""
 _MIN_SPEED_RATIO = 0.5
-"""The smallest share of its speed that a joint keeps from one reading to the next."""
+"""Share of its speed that a joint keeps at least from one reading to the next."""
 
 
 def require_parts(parts: Mapping[str, np.ndarray], declared: Mapping[str, ReadingPart]) -> None:
-    """Raise SafetyStop if a part of a reading is missing, has another shape, or has values that are not possible."""
+    """Raise SafetyStop if a part of a reading is missing, has another shape, or has impossible values."""
     for name, part in declared.items():
         values = np.asarray(parts.get(name, np.zeros(0)), np.float64)
         if name not in parts or values.shape != part.shape:
@@ -41,12 +41,11 @@ class Plausibility:
     **Jumps.** If a position changes by more than ``max_speed_rad_s`` times the time since the last sample, plus the
     uncertainty of times and readings, the robot is stopped.
 
-    **Freeze.** A joint that surely moved faster than ``freeze_rad_s`` from one reading to the next, and then reads the
-    same to the count for ``freeze_s`` and three readings though it is pushed, stops the robot: a motor needs time to
-    stop, and a host that was held up may find a swinging joint where it was. "Surely": more
-    time may have passed between two samples than between their stamps, as the first may be older, and the second as
-    late as its answer. An encoder that freezes just after a reading hardly moves until the following one, so half the
-    speed from the reading before counts there, too.
+    **Freeze.** The robot is stopped if a joint surely moved faster than ``freeze_rad_s`` from one reading to the next,
+    and then reads exactly the same for ``freeze_s`` and three readings although a command pushes it: a motor needs time
+    to stop. "Surely": more time may have passed between two samples than between their stamps, as the first may be
+    older, and the second as late as its answer. An encoder that freezes just after a reading hardly moves until the
+    next one, so half the speed before that reading counts, too.
 
     **Envelope.** A position outside of ``envelope_rad`` stops the robot.
     """
@@ -74,7 +73,7 @@ class Plausibility:
         Raises:
             SafetyStop: A position is not a number, jumped, lies outside of the envelope, or has frozen.
         """
-        # A joint outside of its envelope is named first: the angle of another may be no number.
+        # Check the envelope first: the angle of another joint may be no number.
         self._require_inside(position_rad)
         self._require_finite(position_rad)
         if self._t_s is None or len(position_rad) != len(self._position):
@@ -84,13 +83,13 @@ class Plausibility:
         elapsed_s = max(0.0, t_s - self._t_s)
         self._require_reachable(position_rad, elapsed_s + unsure_s + self._unsure_s)
         self._t_s, self._unsure_s = t_s, unsure_s
-        # Keep for each joint the least speed that explains its last motion; two samples of one time have none.
+        # Keep for each joint the smallest speed that explains its last motion; two samples of one time give none.
         moved = position_rad != self._position
         if elapsed_s > 0.0:
             speed = np.abs(position_rad - self._position) / (elapsed_s + STAMP_S + unsure_s)
             self._speed[moved] = np.maximum(speed, _MIN_SPEED_RATIO * self._before)[moved]
             self._before = speed
-        # Freeze: it counts from the last motion.
+        # Freeze: the time counts from the last motion.
         self._position = position_rad.copy()
         self._since_s[moved] = t_s + unsure_s
         self._same = np.where(moved, 0, self._same + 1)
@@ -99,7 +98,7 @@ class Plausibility:
     def _begin(self, position_rad: np.ndarray, t_s: float, unsure_s: float) -> None:
         n = len(position_rad)
         self._t_s, self._unsure_s, self._position = t_s, unsure_s, position_rad.copy()
-        # Of each joint [rad/s]: before it stood still, and between the last two samples.
+        # Speed of each joint [rad/s]: before it stood still, and between the last two samples.
         self._speed, self._before = np.zeros(n), np.zeros(n)
         self._since_s, self._same = np.full(n, t_s), np.zeros(n, np.int64)
 

@@ -1,4 +1,4 @@
-"""A rig: a device behind the safety gate, and all ways in which its motors are stopped."""
+"""A rig: a device behind the safety gate, with watchdogs that stop its motors."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from sim2real.hardware.safety.plausibility import Plausibility, require_parts
 _LOGGER = logging.getLogger(__name__)
 _CHECK_PERIOD_S: Final = 0.5
 _STOP_WAIT_S: Final = 2.0
-"""Longest wait of `Rig.stop` for a command that is being sent, or for the torque that is going on."""
+"""Longest wait of `Rig.stop` for another thread that sends a command or switches the torque on [s]."""
 _STILL_RAD_S: Final = 0.05
-"""A joint this slow is at rest."""
+"""A joint below this speed is at rest [rad/s]."""
 _FADE: Final = 0.4
-"""Share of a soft stop in which commands fade to zero; in the rest the robot comes to rest."""
+"""Share of a soft stop's time in which commands fade; then the robot comes to rest."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class BusUse:
 
     Attributes:
         transfer_us: From getting the bus to having the answer, retries included [us].
-        wait_us: Wait for another thread's use of the bus [us].
+        wait_us: Time of waiting for another thread to release the bus [us].
     """
 
     transfer_us: array[int] = field(default_factory=lambda: array("q"))
@@ -48,26 +48,25 @@ class BusUse:
 
 
 class Rig:
-    """A device behind a safety gate, commanded in the device's unit; it is opened with the rig, with torque off.
+    """A device behind a safety gate, commanded in the device's unit. The constructor opens it, with torque off.
 
-    Commands, limits and readings here are on the joints' side: an angle is the joint's, and a positive voltage or load
-    pushes towards larger angles of the joint. Only the device has the motors' side.
+    Commands, limits and readings are those of the joints: a positive voltage or load pushes towards larger angles of
+    the joint. Only the device has values of the motors.
 
-    Three mechanisms stop its motors. Every exit of this context takes the torque off. The device's watcher outside of
-    this process does so when this process dies or hangs. A watchdog thread here sends the gate's replacement of a stale
-    command when commands stop while measurements go on: zero, or the last command. Any error in it makes the motors
-    safe; the next call raises it.
+    Three mechanisms stop the motors. Leaving the ``with`` block takes the torque off. The guardian does so when this
+    process dies or hangs. A watchdog thread replaces a stale command, by zero or the last command, when commands stop
+    while measurements go on; an error in this thread makes the motors safe, and the next call raises it.
 
     `start`, `stop`, `command` and the watchdog share one lock: after `stop` nothing is sent.
 
     Args:
         device: The device, not opened yet.
         gate: Limits of the commands, in the device's unit.
-        joints: The mounting of each motor's joint; none: angles and commands are the device's.
+        joints: The mounting of each motor's joint; none: joints have the motors' angles and commands.
 
     Attributes:
-        measuring: The bus's use by `measure` since `start`.
-        commanding: The bus's use by `command` since `start`.
+        measuring: Use of the bus by `measure` since `start`.
+        commanding: Use of the bus by `command` since `start`.
         torque_withheld: Whether this is a dry run; see `withhold_torque`.
         following: How the joints follow their commands, which `measure` checks; None: not known, or not checked.
 
@@ -97,7 +96,7 @@ class Rig:
         self._position_rad: np.ndarray | None = None
         self._sampled_s: float | None = None
         self._tick: int | None = None
-        self._is_first = False  # whether the next command is the first of its sender
+        self._is_first = False  # whether the next command is the first of a new sender
         self._checked_s = 0.0
         # A soft stop: when it began, and the last command before it.
         self._eased_s: float | None = None
@@ -131,10 +130,10 @@ class Rig:
         self.close()
 
     def withhold_torque(self) -> None:
-        """Begin a dry run: until the rig is closed, the device is measured, and neither enabled nor commanded.
+        """Begin a dry run: until the rig is closed, the device is measured, but neither enabled nor commanded.
 
-        All else happens as usual: `command` returns the output of the gate, and measures in the command's place, so
-        that the bus is about as busy.
+        All else happens as usual: `command` returns the output of the gate, and makes a measurement instead of sending,
+        so that the bus is about as busy.
 
         Raises:
             UsageError: Torque is on.
@@ -144,9 +143,9 @@ class Rig:
         self.torque_withheld = True
 
     def start(self) -> None:
-        """Switch the torque on, at rest, and start the watchdog of stale commands; torque is off if this raises."""
+        """Switch the torque on, with the robot at rest, and start the watchdog; if this raises, torque is off."""
         with self._lock:
-            # A new event for the new watchdog: an old one that still runs must end at the old event.
+            # A new event for the new watchdog: an old watchdog that still runs must end at its own event.
             self._done.set()
             self._done = threading.Event()
             self._commanded_s = self._speed_rad_s = self._failure = self._sampled_s = self._eased_s = None
@@ -183,7 +182,7 @@ class Rig:
             HardwareLost: A motor does not confirm; or a command hangs, and the motors were made safe.
         """
         self._done.set()
-        # A command that is being sent comes first, and none follows.
+        # Let a command that is being sent finish; none follows.
         if not self._lock.acquire(timeout=_STOP_WAIT_S):
             self.stop_quietly()
             raise HardwareLost(
@@ -199,7 +198,7 @@ class Rig:
 
     @contextmanager
     def running(self) -> Iterator[None]:
-        """Keep the torque on for a block. It is off afterwards, and no failure to stop replaces the block's error."""
+        """Keep the torque on for a block, and off afterwards; a failure to stop does not hide the block's error."""
         self.start()
         try:
             yield
@@ -209,7 +208,7 @@ class Rig:
         self.stop()
 
     def stop_quietly(self) -> None:
-        """Switch the torque off while another error is reported; takes no lock, never raises."""
+        """Switch the torque off while another error is being raised; takes no lock, never raises."""
         self._done.set()
         self._on, self._sent = False, None
         self.device.make_safe()
@@ -228,17 +227,17 @@ class Rig:
             HardwareLost: The device is silent.
         """
         self._require_no_failure()
-        # Twice a second the device looks for motors that stopped without an error in their answers: before the state is
-        # read, not after, as a measurement should not wait.
+        # Twice a second, look for motors that stopped without an error in their answers. Do so before the state is
+        # read,         # so that the measurement does not wait.
         if (now_s := self._now_s()) - self._checked_s > _CHECK_PERIOD_S:
             self.device.check()
             self._checked_s = now_s
-        # Take the last command before the reading, as it acted while the sample was taken.
+        # Remember the last command before the reading: it acted while the sample was taken.
         sent = self._sent
         measured = self.device.measure()
         reading, transaction = self._mounting.reading(measured), measured.transaction
         self.measuring.add(transaction)
-        # The same sample once again adds nothing to the checks.
+        # Do not check the same sample twice.
         if measured.tick is not None and measured.tick == self._tick:
             return reading
         self._tick = measured.tick
@@ -255,9 +254,9 @@ class Rig:
         return reading
 
     def follow(self, following: Following | None) -> None:
-        """Check from the next `start` on whether the joints follow as an identified model says; see `following`.
+        """Check from the next `start` on whether the joints follow as an identified model predicts; see `following`.
 
-        The limit that the user has set takes the place of the model's; an infinite one ends the check.
+        A limit that the user has set replaces the model's limit; an infinite limit ends the check.
         """
         limit = self.gate.config.following_rad
         if following is not None and following.unit == "rad" and limit is not None:
@@ -265,7 +264,7 @@ class Rig:
         self.following = None if limit is not None and np.all(np.isinf(limit)) else following
 
     def hand_over(self) -> None:
-        """Treat the next command as the first of its sender: it must be near the measured pose, see `command`."""
+        """Treat the next command as the first of a new sender: it must be near the measured pose, see `command`."""
         self._is_first = True
 
     def command(self, command: np.ndarray, age_s: float, now_s: float) -> np.ndarray:
@@ -300,7 +299,7 @@ class Rig:
         now_s, max_age_s = self._now_s(), self.gate.config.max_sample_age_s
         age_s = 0.0 if self._sampled_s is None else now_s - self._sampled_s  # before the first, the robot is at rest
         if age_s > max_age_s:
-            # A process that was stopped for a while reports the guardian's action as the reason.
+            # If this process was stopped for a while, report that the guardian has acted.
             self.device.require_watching()
             raise SafetyStop(
                 f"node {self.gate.config.node!r} stopped: the newest measurement is {age_s:.3g} s old, "
@@ -309,9 +308,9 @@ class Rig:
             )
 
     def ease(self) -> None:
-        """Begin a soft stop: from now on commands fade to what replaces a stale one, within ``stop_s``.
+        """Begin a soft stop: within ``stop_s``, commands fade to the replacement of a stale command.
 
-        Voltages fade to zero, goals keep their values, and legs sink: their gains fade to damping.
+        Voltages fade to zero, goals stay, and legs sink, as their gains fade to damping.
         """
         self._eased_s, self._before_stop = self._now_s(), self._sent
 
@@ -332,7 +331,7 @@ class Rig:
     def _softened(self, command: np.ndarray) -> np.ndarray:
         if self._eased_s is None or self._before_stop is None:
             return command
-        # A goal that is held stays the last one; a voltage that fades is the agent's newest.
+        # A held goal is the last one; a fading voltage is a share of the agent's newest command.
         config = self.gate.config
         last = self._before_stop if config.holds else np.asarray(command)
         left = max(0.0, 1.0 - (self._now_s() - self._eased_s) / (_FADE * config.stop_s))
@@ -367,7 +366,7 @@ class Rig:
             self.clock.sleep(0.02)
 
     def _begin_at_rest(self) -> np.ndarray:
-        """Switch the torque on, and return the command that the joints follow; without torque, the safe one there."""
+        """Switch the torque on, and return the command that the joints follow; in a dry run, the command at rest."""
         if not self.torque_withheld:
             return self._mounting.to_joints(self.device.enable())
         units, here = self.device.commanded.units, self._mounting.reading(self.device.measure()).position_rad
@@ -375,7 +374,7 @@ class Rig:
         return self.gate.config.at_rest(columns if self.gate.config.has_columns else columns[:, 0])
 
     def _require_near(self, command: np.ndarray) -> None:
-        """Refuse a sender whose first goals are far away from the measured pose."""
+        """Refuse first goals of a sender that are far away from the measured pose."""
         if not self._is_first:
             return
         self._is_first = False
@@ -420,13 +419,12 @@ class Rig:
         self.clock.repeat(lambda: self._watch(done), period_s, done, "sim2real:watchdog")
 
     def _watch(self, done: threading.Event) -> None:
-        """Send the gate's fallback before the first command, and when the last one is too old: its loop may hang.
+        """Send the gate's fallback before the first command, and when the last command is too old: its loop may hang.
 
-        Raises nothing: an error makes the motors safe, is printed, and is raised by the loop's next call, if the loop
-        still runs.
+        Never raises: an error makes the motors safe and is printed; the control loop's next call raises it.
 
         Args:
-            done: The event of the watchdog that calls this; the rig may have been stopped and started since.
+            done: The event of this watchdog; after a stop and a new start, the rig has another event.
         """
         try:
             with self._lock:

@@ -1,4 +1,4 @@
-"""The connection to a robot over DDS: its address, one writer of commands, one reader of states, and their stream."""
+"""The connection to a robot over DDS: address, writer of commands, reader of states, and stream of states."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ except ImportError as error:
 
 _HIGHEST_DOMAIN: Final = 232
 QUEUE: Final = 16
-"""States that wait for `next_state`: 32 ms of them at 500 Hz."""
+"""Most states that wait for `next_state`: 32 ms at 500 Hz."""
 LEASE_S: Final = 2
-"""Time after which a program that has died no longer counts as a writer [s]; by default it is 10 s."""
+"""Time after which a program that has died no longer counts as a writer [s]; the default of DDS is 10 s."""
 
 PERIOD_S: Final = 0.002
-"""Time between two states of a Go2."""
+"""Time between two states of a Go2 [s]."""
 _LATE_S: Final = 0.005
-"""A state that arrives this long after the call is late."""
+"""A state that arrives this long after the call is late [s]."""
 _TICKS: Final = 2
-"""Ticks from one state to the next: milliseconds."""
+"""Ticks [ms] from one state to the next."""
 
 
 @dataclass(frozen=True)
@@ -51,8 +51,8 @@ class Address:
     """A robot's address: ``INTERFACE:DOMAIN``, such as ``eth0:0``.
 
     Args:
-        interface: Network interface, its name or its IP address; "": Cyclone DDS chooses, or `CYCLONEDDS_URI` does.
-        domain: Number of the DDS domain; that of a Go2 is 0.
+        interface: Name or IP address of the network interface; "": chosen by Cyclone DDS, or by `CYCLONEDDS_URI`.
+        domain: Number of the DDS domain; a Go2 has domain 0.
     """
 
     interface: str
@@ -60,7 +60,7 @@ class Address:
 
     @classmethod
     def parse(cls, port: str) -> Self:
-        """Return the address of a text; without ``:DOMAIN`` the domain is 0."""
+        """Parse an address; without ``:DOMAIN`` the domain is 0."""
         interface, colon, number = port.rpartition(":")
         if not colon:
             interface, number = port, "0"
@@ -90,7 +90,7 @@ class Address:
 
 
 _DOMAINS: Final[dict[int, tuple[Address, Domain]]] = {}
-"""The domains that this process has opened: Cyclone DDS has one configuration for each, so connections share it."""
+"""Domains that this process has opened -> configuration: Cyclone DDS has one for each domain."""
 
 
 class DdsLink:
@@ -134,7 +134,7 @@ class DdsLink:
             raise self._lost("takes no command", error) from error
 
     def next_state(self, timeout_s: float) -> LowState | None:
-        """Return the oldest state that was not returned yet, which may be damaged; None after the timeout."""
+        """Return the oldest state that was not returned yet, perhaps a damaged one; None after the timeout."""
         with self._reading:
             entities = self._entities
             if entities is None:
@@ -150,15 +150,15 @@ class DdsLink:
                         return None
                 except DDSException as error:
                     raise self._lost("sends no state", error) from error
-                except ValueError:  # bytes of another message; an empty state is not intact
+                except ValueError:  # bytes of another message: return an empty state, whose CRC is wrong
                     return LowState()
 
     def other_writers(self) -> list[str]:
-        """Return the other programs that publish commands: the mark of each, or its number."""
+        """Return the marks (or numbers) of other programs that publish commands."""
         entities = self._entities
         if entities is None:
             raise self._closed()
-        # Only what changed since the last call: a robot has about a hundred writers.
+        # Read only changes since the last call: a robot has about a hundred writers.
         for sample in entities.publications.take(1000):
             if not sample.sample_info.valid_data:
                 self._writers.pop(sample.key, None)
@@ -169,7 +169,7 @@ class DdsLink:
         return list(self._writers.values())
 
     def guardian(self, drive: LegDrive, silence_s: float, settle_s: float) -> Guardian:
-        """Start a guardian in a process of its own, with a writer of its own; arguments as in `Guardian`."""
+        """Start a guardian in a separate process with its own writer; arguments as in `Guardian`."""
         arguments = [str(self.address), self._mark.decode(), repr(drive.damping), repr(drive.lie_s)]
         place = "sim2real.hardware.unitree.device:guarded"
         return Guardian(lambda longest_s: Process(place, arguments, longest_s), silence_s, settle_s)
@@ -177,7 +177,7 @@ class DdsLink:
     def close(self) -> None:
         """Close the connection. May be called twice."""
         with self._reading:
-            self._entities = None  # CPython deletes them now, or when a thread's write has ended
+            self._entities = None  # CPython deletes the entities now, or when a running write has ended
 
     def _closed(self) -> HardwareLost:
         return HardwareLost(f"the robot on {self.address} is not open", hint="call open first")
@@ -189,9 +189,9 @@ class DdsLink:
 
 
 class StateStream:
-    """Reads states in their order; drops those with a wrong CRC, and counts missing, late and overtaken ones.
+    """Reads states in order; drops states with a wrong CRC, and counts missing, late and overtaken states.
 
-    Missing and damaged ones show as a gap in the ticks.
+    A missing or damaged state leaves a gap in the ticks.
 
     Args:
         max_silence_s: Time without a state after which the robot is lost [s].
@@ -217,13 +217,13 @@ class StateStream:
         """Return the first state that arrives after the call, and its times; raise HardwareLost if none does."""
         called_ns = self._clock.now_ns()
         with self._lock:
-            # The states that came before are older than the step that reads them.
+            # Drop states that came before the call: they are older than the step that reads them.
             begin_ns = self._clock.now_ns()
             while (old := self.robot.next_state(0.0)) is not None:
                 self._is_next(old)
             lost = self._lost
             state = self._await(self._max_silence_s, self._is_next)
-            # Count it.
+            # Count the state.
             arrived_ns = self._clock.now_ns()
             retries, waited_s = self._lost - lost, 1e-9 * (arrived_ns - begin_ns)
             late_s = max(0.0, waited_s - PERIOD_S * (1 + retries))
@@ -235,7 +235,7 @@ class StateStream:
         return state, Transaction(arrived_ns, *times)
 
     def counters(self, commands: int) -> Counters:
-        """Return the counts, with those of the commands."""
+        """Return the counts of states and of commands."""
         done = self._answered + commands
         return Counters(done, self._lost, self._retries, self._late, np.array(self._late_s))
 
@@ -255,12 +255,12 @@ class StateStream:
         if not state.intact:
             return False
         tick, now_s = int(state.record["tick"]), self.robot.now_s()
-        # The counter of 32 bits starts again at 0.
+        # The 32-bit counter starts again at 0.
         ahead = (tick - (self._tick or 0) + 2**31) % 2**32 - 2**31
         if ahead <= 0:
             self._late += 1
             return False
-        # After a pause the queue has dropped states itself.
+        # After a pause, the queue itself has dropped states.
         if now_s - self._taken_s < (QUEUE - 2) * PERIOD_S:
             self._lost += max(0, round(ahead / _TICKS) - 1)
         self._tick, self._taken_s = tick, now_s
@@ -279,7 +279,7 @@ class StateStream:
 
 
 EMULATED: Final[dict[Address, Callable[[str], DdsLink]]] = {}
-"""Address -> connects, with a mark, to an emulated robot in this process: `emulation`."""
+"""Address -> function that connects, with a mark, to an emulated robot in this process."""
 
 
 def connect(address: Address, mark: str) -> DdsLink:
@@ -293,7 +293,7 @@ class _Entities:
 
     def __init__(self, domain: int, mark: bytes) -> None:
         participant = DomainParticipant(domain)
-        # Reliable, as Unitree's own client: a robot's reader of either kind accepts it. A write never blocks.
+        # Reliable, like Unitree's own client: both kinds of readers accept it. A write never blocks.
         xcdr1 = Policy.DataRepresentation(use_cdrv0_representation=True)
         reliable = Policy.Reliability.Reliable(max_blocking_time=0)
         qos = Qos(reliable, Policy.History.KeepLast(1), Policy.Userdata(mark), xcdr1)

@@ -42,15 +42,16 @@ PARTS: Final[Mapping[str, ReadingPart]] = MappingProxyType(
         "battery_charge": ReadingPart("%", (), 0.0, 100.0),
     }
 )
-"""Parts of a reading. The quaternion is (w, x, y, z). Gyro and accelerometer of this kind reach 35 rad/s and 157 m/s^2.
-The force on a foot is the count of its sensor, in the order FR, FL, RR, RL: Unitree documents no unit."""
+"""Parts of a reading. The quaternion is (w, x, y, z). Sensors of this kind measure up to 35 rad/s and 157 m/s^2. Forces
+on feet are counts of the sensors, in the order FR, FL, RR, RL: Unitree documents no unit.
+"""
 _WEAK_NM, _WEAK_S = 5.0, 0.1
-"""By how much a motor's torque may be weaker than its law [N m], on average over a time [s]."""
+"""By how much a motor's torque may be weaker than commanded [N m], on average over a time [s]."""
 _LOGGER = logging.getLogger(__name__)
 _FIRST_STATE_S: Final = 5.0
 _OPEN_S: Final = 3.0
 _DISCOVERY_S: Final = 1.0
-"""Time in which DDS finds the writers of a robot's domain [s]."""
+"""Time in which DDS discovers the writers of a robot's domain [s]."""
 _CONFIRM_S: Final = 1.0
 """Longest time in which motors confirm that they are on, or off [s]."""
 _SETTLE_S: Final = 1.5
@@ -60,9 +61,9 @@ _SETTLE_S: Final = 1.5
 class UnitreeLegs(Device):
     """The twelve motors of a Go2, each with a position controller, a velocity controller and a torque.
 
-    The robot publishes its state at 500 Hz without a request; `measure` waits for the next one. A command is published
-    once. If commands stop, the guardian lets the legs damp and takes the torque off when the robot
-    lies: a process with a writer of its own, which starts before torque goes on.
+    The robot publishes its state at 500 Hz without a request; `measure` waits for the next state. A command is
+    published once. If commands stop, the guardian, a separate process with its own writer, lets the legs damp, and
+    takes the torque off when the robot lies.
 
     Args:
         port: Network interface and DDS domain, such as ``eth0:0``; see `Address`.
@@ -102,7 +103,7 @@ class UnitreeLegs(Device):
             CommandColumn("kd", "N m s/rad", self.drive.damping),
             CommandColumn("tau", "N m", "zero"),
         )
-        self._damp = self.drive.damp()  # built here, as make_safe must not need any time
+        self._damp = self.drive.damp()  # built now, because make_safe must not take any time
         self._stream: StateStream | None = None  # the open connection
         self._guardian: Guardian | None = None
         self.armed = self.halted = False
@@ -135,11 +136,11 @@ class UnitreeLegs(Device):
         robot = connect(self.address, mark)
         self.clock = robot.clock
         try:
-            # States must come, and no other writer may command the motors.
+            # The robot must send states, and no other program may command the motors.
             stream = StateStream(robot, self._max_silence_s)
             state = stream.begin(_OPEN_S)
-            # Motors that are on have a program, perhaps one that is not discovered yet: to damp would lay it down. A
-            # program that was killed is a writer until its lease is over.
+            # If motors are on, a program commands them, perhaps one that DDS has not discovered yet: damping would lay
+            # the         # robot down. A killed program counts as a writer until its lease ends.
             self._wait(_DISCOVERY_S if motors_on(state) else 0.0, lambda: bool(robot.other_writers()))
             self._wait(LEASE_S + 1.0, lambda: not robot.other_writers())
             _require_alone(robot, HardwareLost)
@@ -153,11 +154,11 @@ class UnitreeLegs(Device):
         atexit.register(self.close)
 
     def without_host(self) -> tuple[str, ...]:
-        """Return the worst reaction, as a motor of the GO family has (unitree_actuator_sdk, issue 29); not measured."""
+        """Return the worst reaction of a motor of the GO family (unitree_actuator_sdk, issue 29); not measured."""
         return (f"Go2 ({', '.join(self.motors)}) goes on as commanded last (no other reaction is documented)",)
 
     def facts(self) -> dict[str, dict[str, str]]:
-        # Versions of 0 are those that the robot does not report.
+        # The robot sends 0 for versions that it does not report.
         record = self.stream.next()[0].record
         bms = record["bms_state"]
         numbers = {"LowState": record["version"].tolist(), "battery": [bms["version_high"], bms["version_low"]]}
@@ -174,7 +175,7 @@ class UnitreeLegs(Device):
         return low[self._places], high[self._places]
 
     def enable(self) -> np.ndarray:
-        """Start the guardian, and let all motors damp at their positions; see `Device.enable`."""
+        """Start the guardian, and let all motors damp; see `Device.enable`."""
         rest = np.zeros((MOTORS, 5))
         low, high = self.reach()
         # A robot that lies may rest on the stops of its joints, a little beyond their range.
@@ -189,7 +190,7 @@ class UnitreeLegs(Device):
 
     def measure(self) -> Reading:
         """Wait for the next state: positions [rad], speeds [rad/s], estimated torques [N m], and `PARTS`."""
-        # A guardian that has taken over is the reason of silence and of torque that is off.
+        # If the guardian has taken over, it is the reason for silence and for torque that is off.
         self._beat()
         armed = self.armed
         try:
@@ -217,7 +218,7 @@ class UnitreeLegs(Device):
                 raise SafetyStop("no command is sent: the torque is off", hint="enable it, or open the robot again")
             self._beat()
             self.stream.robot.write(message)
-            if self.halted:  # `make_safe` takes no lock: this command may have followed it
+            if self.halted:  # `make_safe` takes no lock: this command may have been published after it
                 self.make_safe()
             self._published += 1
             return Transaction(begin_ns, begin_ns - called_ns, self.clock.now_ns() - begin_ns, 0)
@@ -234,7 +235,7 @@ class UnitreeLegs(Device):
     def disable(self) -> None:
         """Let the legs damp until they are still, at most `LegDrive.lie_s`; then torque off, confirmed."""
         robot, guardian = self.stream.robot, self._guardian
-        with self._commanding:  # a command that is being published comes first
+        with self._commanding:  # let a command that is being published finish
             self.armed = False
         if self._on and guardian is not None:
             if failure := self._lie_down(robot, guardian):
@@ -258,7 +259,7 @@ class UnitreeLegs(Device):
             return
         robot = stream.robot
         self.halted, self.armed = True, False
-        # A command that is being published comes first; a signal handler may have interrupted it, so do not wait long.
+        # Let a command that is being published finish; a signal handler may have interrupted it, so do not wait long.
         if self._commanding.acquire(timeout=_CONFIRM_S):
             self._commanding.release()
         self._leaving = True
@@ -282,7 +283,7 @@ class UnitreeLegs(Device):
             self._guardian = robot.guardian(self.drive, self.silence_s, self.drive.lie_s + _SETTLE_S)
         _require_alone(robot, SafetyStop)
         self._guardian.arm()
-        # Commands may be lost, so each state is answered with one until all motors are on.
+        # Commands may be lost, so send one after each state until all motors are on.
         with self._commanding:
             self._on, end_s = True, self._now_s() + _CONFIRM_S
             try:
@@ -303,17 +304,17 @@ class UnitreeLegs(Device):
                     self.make_safe()
 
     def _lie_down(self, robot: DdsLink, guardian: Guardian) -> str:
-        """Lay the robot down, and return the failure or "". A guardian that has taken over lets it damp before."""
+        """Lay the robot down; return the failure or "". If the guardian has taken over, let it finish first."""
 
         def live() -> None:
-            with suppress(SafetyStop):  # it takes over, or has died: go on all the same
+            with suppress(SafetyStop):  # the guardian takes over, or has died: go on all the same
                 guardian.beat()
 
         guardian.settle()
         drive = replace(self.drive, lie_s=0.0) if guardian.took_over else self.drive
         try:
             failure = sit_down(robot, drive, _CONFIRM_S, live)
-        except Exception as error:  # whatever it is, the guardian goes on
+        except Exception as error:  # whatever went wrong, the guardian goes on
             failure = f"{type(error).__name__}: {error}"
         self._on = bool(failure)
         return failure
@@ -374,7 +375,7 @@ def _require_alone(robot: DdsLink, kind: type[HardwareLost] | type[SafetyStop]) 
 
 
 def motors_of(robot: DdsLink, drive: LegDrive) -> Motors:
-    """Return the legs as a guardian watches them; after their torque was off, another program may have the robot."""
+    """Return the legs for a guardian; once their torque was off, another program may command the robot."""
 
     def take_torque_off() -> str:
         try:
@@ -386,7 +387,7 @@ def motors_of(robot: DdsLink, drive: LegDrive) -> Motors:
 
 
 def guarded(address: str, mark: str, damping: str, lie_s: str) -> Motors:
-    """Return the legs that a guardian's process watches, once their states come."""
+    """Connect from the guardian's process; return the legs once their states come."""
     robot = DdsLink(Address.parse(address), mark)
     if robot.next_state(_FIRST_STATE_S) is None:
         sys.exit(f"sim2real guardian: the robot on {address} sends no state")
@@ -395,5 +396,5 @@ def guarded(address: str, mark: str, damping: str, lie_s: str) -> Motors:
 
 def legs(port: str, ids: Sequence[int], drive: Any, *, baud_rate: int, silence_s: float) -> UnitreeLegs:
     """Return the legs of a Go2, not opened yet: the device of the name ``unitree``; see ``load_device``."""
-    del baud_rate  # a network has none
+    del baud_rate  # a network has no baud rate
     return UnitreeLegs(port, ids, drive, silence_s=silence_s, max_silence_s=max(0.1, silence_s))

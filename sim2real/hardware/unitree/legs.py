@@ -1,4 +1,4 @@
-"""The motors of a Go2: names, limits, commands, and the safe way out: they damp until it lies, then they are off."""
+"""The motors of a Go2: names, limits, commands, and the safe stop: damp until the robot lies, then torque off."""
 
 from __future__ import annotations
 
@@ -27,30 +27,30 @@ if TYPE_CHECKING:
 NAMES: Final = tuple(f"{leg}_{joint}" for leg in ("FR", "FL", "RR", "RL") for joint in ("hip", "thigh", "calf"))
 """The motors in the order of the messages."""
 COLUMNS: Final = ("q", "dq", "kp", "kd", "tau")
-"""Columns of a motor's law: its torque is ``tau + kp (q - measured q) + kd (dq - measured dq)``."""
+"""Columns of a motor's command: its torque is ``tau + kp (q - measured q) + kd (dq - measured dq)``."""
 _HIP, _CALF = (-1.0472, 1.0472), (-2.7227, -0.83776)
 _FRONT, _REAR = (-1.5708, 3.4907), (-0.5236, 4.5379)
 RANGE_RAD: Final = np.array([_HIP, _FRONT, _CALF] * 2 + [_HIP, _REAR, _CALF] * 2)
-"""Lowest and highest angle of each joint [rad], ``(12, 2)``, of Unitree's description of the Go2."""
+"""Lowest and highest angle of each joint [rad], ``(12, 2)``, from Unitree's description of the Go2."""
 TORQUE_NM: Final = np.array([23.7, 23.7, 45.4] * 4)
-"""Largest torque of each motor [N m], of the same description."""
+"""Largest torque of each motor [N m], from the same description."""
 _STILL_RAD_S, _STILL_S = 0.2, 0.3
-"""The robot lies when all joints have been this slow for this time."""
+"""The robot lies when all joints have been below this speed [rad/s] for this time [s]."""
 _PERIOD_S: Final = 0.01
-"""Time between two commands if no state comes."""
+"""Time between two commands if no state comes [s]."""
 _HELD_S: Final = 0.05
-"""Shortest time for which "off" is published, as a command may be lost or overtaken."""
+"""Shortest time for which "off" is published, because a command may be lost or overtaken [s]."""
 
 
 @dataclass(frozen=True)
 class LegDrive:
-    """Limits of the commands, and of the safe way out.
+    """Limits of the commands, and of the safe stop.
 
     Args:
         kp_max: Largest position gain [N m/rad].
         kd_max: Largest velocity gain [N m s/rad].
         speed_max: Largest goal of the speed [rad/s].
-        damping: Velocity gain of legs that damp [N m s/rad].
+        damping: Velocity gain of damping legs [N m s/rad].
         lie_s: Longest time that legs damp before the torque goes off [s].
     """
 
@@ -112,7 +112,7 @@ def motors_on(state: LowState) -> list[str]:
 def sit_down(robot: DdsLink, drive: LegDrive, give_up_s: float, alive: Callable[[], None] = lambda: None) -> str:
     """Let the motors damp until the robot lies, then take their torque off until every motor confirms it.
 
-    A robot whose motors are off already gets "off" alone. A robot whose states do not come gets all the same commands.
+    If the motors are off already, only "off" is sent. If no states come, all commands are sent.
 
     Args:
         give_up_s: Longest time for the motors to confirm that they are off [s].
@@ -121,7 +121,7 @@ def sit_down(robot: DdsLink, drive: LegDrive, give_up_s: float, alive: Callable[
     Returns:
         The reason if the motors do not confirm, else "".
     """
-    # Damp, if a state that is not older than this call shows motors on.
+    # Damp, unless a state received after this call shows that all motors are off.
     while robot.next_state(0.0) is not None:
         pass
     state = _state(robot, 5 * _PERIOD_S)

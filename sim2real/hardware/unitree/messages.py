@@ -29,16 +29,16 @@ MOTORS: Final = 12
 HEAD: Final = (0xFE, 0xEF)
 """The first two bytes of a command."""
 LOW_LEVEL: Final = 0xFF
-"""`level_flag` of a command to the motors themselves."""
+"""`level_flag` of a low-level command, which goes to the motors."""
 OFF, SERVO = 0x00, 0x01
-"""Modes of a motor: off, or it follows `q`, `dq`, `kp`, `kd` and `tau`."""
+"""Modes of a motor: off, and on (it follows `q`, `dq`, `kp`, `kd` and `tau`)."""
 NO_POSITION: Final = 2.146e9
 """`q` of a motor without a position controller (Unitree's PosStopF)."""
 NO_VELOCITY: Final = 16000.0
 """`dq` of a motor without a velocity controller (Unitree's VelStopF)."""
 
-# Unitree's package unitree_go, type by type, each field with its type and its number: robots and other programs match
-# the types by names and structure. Rates are in rad/s, accelerations in m/s^2, quaternions (w, x, y, z), currents in
+# The types of Unitree's package unitree_go: each field with its type and number of values. Robots and other programs
+# match # types by name and structure. Rates are in rad/s, accelerations in m/s^2, quaternions (w, x, y, z), currents in
 # mA, states of charge in %; `tick` counts milliseconds.
 _FIELDS: Final = {
     "MotorCmd": "mode u1, q f4, dq f4, tau f4, kp f4, kd f4, reserve u4*3",
@@ -68,10 +68,10 @@ _REVERSED: Final = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 
 
 def crc32(record: np.ndarray) -> int:
-    """Return the CRC of a record: over its words but the last, polynomial 0x04c11db7, most significant bit first.
+    """Return the CRC of all words but the last (polynomial 0x04c11db7, most significant bit first).
 
-    zlib computes the same polynomial from the least significant bit on, so bytes and result are reversed: 2 us for a
-    command and 3 us for a state, against 360 us bit by bit in Python.
+    zlib starts at the least significant bit, so bytes and result are reversed: 2 us for a command and 3 us for a state,
+    against 360 us bit by bit in Python.
     """
     big_endian = np.frombuffer(record.tobytes(), "<u4")[:-1].byteswap().tobytes()
     reflected = zlib.crc32(big_endian.translate(_REVERSED)) ^ 0xFFFFFFFF
@@ -108,10 +108,10 @@ def _aligned(offset: int) -> int:
 
 
 class _Record:
-    """A message that is a record in memory, in place of one Python object for each field.
+    """A message in memory as one numpy record, not as a Python object for each field.
 
-    On the wire (XCDR1) the bytes are those of the C struct, except that the first motor's `mode` follows the byte
-    before it without padding: `_cut` is the place of that mode on the wire. `_content` is 0 at the bytes of padding.
+    On the wire (XCDR1) the bytes are those of the C struct, except that no padding precedes the first motor's `mode`:
+    `_cut` is the position of this mode on the wire. `_content` is 0 at the bytes of padding.
     """
 
     layout: ClassVar[np.dtype]
@@ -149,7 +149,7 @@ class _Record:
 
 
 def _type(name: str, *bases: type) -> Any:
-    """Return the class of a type for `cyclonedds`, to which the first base is the parent of the type in the IDL."""
+    """Return the class of a type for `cyclonedds`, for which the first base is the type's parent in the IDL."""
     hints = {}
     for field, kind, count in _fields(name):
         element = _NUMBERS.get(kind) or _type(kind)
@@ -170,7 +170,7 @@ def _message(name: str, motors: str, padding: int) -> Any:
     message._cut = layout.fields[motors][1] - padding
     message.serialize = lambda self, **_: self.to_wire()
     message.deserialize = lambda data, **_: message.from_wire(data)
-    # A writer that leaves sends the fields of a key; these messages have none.
+    # When a writer leaves, it sends the key of a message; these messages have none.
     message.deserialize_key = lambda *_, **__: message()
     return message
 
@@ -178,7 +178,7 @@ def _message(name: str, motors: str, padding: int) -> Any:
 if TYPE_CHECKING:
 
     class LowCmd(_Record, idl.IdlStruct):
-        """A command of all motors; its torque is ``tau + kp (q - measured q) + kd (dq - measured dq)`` in the motor."""
+        """A command of all motors; a motor's torque is ``tau + kp (q - measured q) + kd (dq - measured dq)``."""
 
     class LowState(_Record, idl.IdlStruct):
         """The state of all motors, the inertial measurement unit, the feet and the battery."""
