@@ -258,7 +258,7 @@ def test_a_missing_servo_is_named_with_those_that_answer():
         (
             (sts.MAX_POSITION, 3000),
             Joint("pan", 1, homing_offset=0),
-            "goes from 0 to 3000 counts only, its joint from 0 to 4095",
+            "accepts 0 to 3000 counts only, its joint needs 0 to 4095",
         ),
         (
             (sts.ID, 1),
@@ -287,7 +287,7 @@ def test_servos_that_do_not_fit_their_joints(change, joint, said):
         (StsServos, {"baud_rate": 2_000_000}, (1,), "baud rate"),
         (StsServos, {"silence_s": math.nan}, (1,), "silence_s"),
         (StsServos, {"max_silence_s": -1.0}, (1,), "max_silence_s"),
-        (StsServos, {}, (Joint("a", 1), Joint("b", 1)), r"servos \[1, 1\]: .* an id of its own"),
+        (StsServos, {}, (Joint("a", 1), Joint("b", 1)), r"servos \[1, 1\]: .* another id"),
     ],
 )
 def test_configurations_that_make_no_sense(kind, config, joints, message):
