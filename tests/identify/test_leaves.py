@@ -99,5 +99,5 @@ def test_paths_that_lead_nowhere(tree, act, path, message):
 
 
 def test_a_path_ends_at_its_index(tree):
-    with pytest.raises(UsageError, match="only its last step may have one"):
+    with pytest.raises(UsageError, match="only the last name may have one"):
         set_leaf({"a": [tree]}, "a[0].sensor", 1.0)
