@@ -139,7 +139,7 @@ def test_a_problem_knows_its_links(fitted):
 
 
 def test_without_a_delay_of_the_measurements_there_is_no_link(fitted):
-    with pytest.raises(UsageError, match="one that is identified"):
+    with pytest.raises(UsageError, match="an identified delay"):
         measured(fitted.problem.table.with_fixed({"actuator_delay": 0.02}))
 
 
