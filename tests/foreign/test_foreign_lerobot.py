@@ -180,3 +180,28 @@ def test_without_pyarrow_the_error_names_it(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
     with pytest.raises(UsageError, match=r"needs pyarrow\n\nhint: pip install 'pyarrow"):
         open_tables(tmp_path / "set")
+
+
+def test_a_unit_that_the_calibration_contradicts_is_refused(tmp_path):
+    (table, *_) = open_tables(data_set(tmp_path / "set", in_unit("deg")))
+    hints = ImportHints("so101", joints=tuple(NAMES), unit="hundredths", calibration=calibration(tmp_path / "c.json"))
+    with pytest.raises(UsageError, match="in deg, not in hundredths"):
+        propose(table, hints)
+
+
+def test_episodes_that_are_too_short_to_check_are_left_out(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    calibration(tmp_path / "c.json")
+    short = tuple(values[:3] for values in motion(120))
+    data_set(tmp_path / "set", in_unit("deg", [short, *EPISODES]))
+    assert cli.main(["import", "set", "--like", "so101", "--calibration", "c.json"]) == 0
+    assert "1 of 4 episodes" in capsys.readouterr().err
+    assert len(list(tmp_path.glob("runs/so101/*/record/*.mcap"))) == 3
+
+
+def test_the_names_of_older_sets_are_those_of_the_arm(tmp_path):
+    root = data_set(tmp_path / "set", in_unit("deg"), names=[f"main_{name}" for name in NAMES], robot="so100")
+    hints = ImportHints("so101", joints=tuple(NAMES), calibration=calibration(tmp_path / "c.json"))
+    found = propose(open_tables(root)[0], hints)
+    assert not found.questions
+    assert len(found.mapping.nodes["sensor"].fields["position"].scale) == 6

@@ -96,6 +96,9 @@ def test_a_vendors_names_are_matched_by_leg_and_number(tmp_path):
         (("front_left_knee", "front_left_hip"), ("FL_hip_joint", "FL_calf_joint"), [1, 0]),
         (("b", "a"), ("a_joint", "b_joint"), [1, 0]),
         (("hip_FR", "hip_FL", "calf_FR", "calf_FL"), ("FL_hip", "FL_calf", "FR_hip", "FR_calf"), [1, 3, 0, 2]),
+        (("ur5e_lift", "ur5e_pan"), ("pan_joint", "lift_joint"), [1, 0]),
+        (("lift", "pan"), ("ur5e/pan", "ur5e/lift"), [1, 0]),
+        (("left_pan", "left_lift"), ("right_pan", "right_lift"), None),
         (("A3", "A1", "A2"), ("iiwa_joint_1", "iiwa_joint_2", "iiwa_joint_3"), [1, 2, 0]),
         (("m0", "m1"), ("joint1", "joint2"), [0, 1]),
         (("j2", "j3"), ("joint1", "joint2"), None),
@@ -167,6 +170,15 @@ def test_names_that_exist_and_do_not_match_are_never_no_names(tmp_path, nameless
         return
     with pytest.raises(UsageError, match=r"left, right.*hip, knee"):
         proposed(tmp_path / "run.npz", joints=("hip", "knee"))
+
+
+@pytest.mark.parametrize("names", [("pan", "lift"), ("j1", "j2")])
+@pytest.mark.parametrize("of_robot", [True, False])
+def test_goals_of_the_left_arm_are_not_of_the_right_one(tmp_path, names, of_robot):
+    columns = {"t_s": T} | {f"goal_left_{n}_rad": GOAL[:, i] for i, n in enumerate(names)}
+    columns |= {f"q_right_{n}_rad": Q[:, i] for i, n in enumerate(names)}
+    with pytest.raises(UsageError, match=r"left.*right"):
+        proposed(csv(tmp_path / "run.csv", columns), joints=names if of_robot else ())
 
 
 def test_goals_and_positions_of_other_joints_are_refused(tmp_path):

@@ -23,6 +23,8 @@ _MAX_ROWS = 6000
 """Compared rows; a longer recording is thinned."""
 _FINER = 4
 """Compared rows for each sample, as a fast tone turns its sign within two samples."""
+LEAST = 50
+"""Fewest samples that can be checked."""
 _LAGS_S = (-0.3, 0.6)
 _CLOCK_LAGS_S = (-1.0, 1.5)
 """Of parts, as a clock that was set changes the lag."""
@@ -72,6 +74,7 @@ CHECKS = {
     "order": ("source", "list the sources in the order of the positions"),
     "lag": ("", "exchange the names, or correct stamp_offset"),
     "overlap": ("", "stamp_offset of the commands adds seconds to their clock, in a mapping"),
+    "short": ("", "record longer"),
     "clock": ("", "stamp both streams with one clock, such as a recorder's"),
     "copy": ("", "log the commands that were sent, not the measurements"),
     "zero": ("", "cut the file where the zero moves: --samples A:B"),
@@ -111,6 +114,8 @@ def check(
         unit: Unit of both; empty for hinges beside slides.
     """
     found = respond(t_s, goal, position, acting)
+    if found is None and (samples := min(map(len, t_s))) < LEAST:
+        return [Check("short", -1, f"{samples} samples are fewer than {LEAST}: nothing is checked", "refuse")]
     if found is None:
         text = "the stamps of goals and positions overlap in fewer than 50 samples: nothing is checked"
         return [Check("overlap", -1, text, "refuse")]

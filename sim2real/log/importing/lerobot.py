@@ -167,7 +167,8 @@ def conversion(calibration: Path, joints: Sequence[str], unit: str) -> tuple[lis
             f"{calibration} is no calibration of LeRobot: {error!r}", hint="lerobot-calibrate writes one"
         ) from None
     scales, offsets = [], []
-    for joint in joints:
+    for label in joints:
+        joint = next((n for n in ranges if label == n or label.endswith(f"_{n}")), label)  # main_elbow_flex in v2
         if joint not in ranges:
             raise UsageError(
                 f"{calibration} has no {joint!r}. Available: {', '.join(ranges)}", hint="name its own file"

@@ -190,12 +190,15 @@ def _spellings(joint: str) -> set[str]:
 def columns_of(joints: Sequence[str], labels: Sequence[str]) -> tuple[list[int], str] | None:
     """Return the column of each joint of a robot by the labels of columns, and how they match; None if they do not.
 
-    Names match as they are, by number, if only numbers tell them apart, or by leg and part: a vendor's ``FR_0`` is the
-    first joint of the front right leg, ``LF_HAA`` the hip of the front left one.
+    Names match as they are, or without the prefix that all of one side have, by number, if only numbers tell them
+    apart, or by leg and part: a vendor's ``FR_0`` is the first joint of the front right leg, ``LF_HAA`` the hip of the
+    front left one.
     """
-    exact = [[i for i, label in enumerate(labels) if same_joint(label, joint)] for joint in joints]
-    if all(len(found) == 1 for found in exact):
-        return [found[0] for found in exact], "by name"
+    sides = (joints, labels, ""), (joints, _short(labels), ", without a prefix"), (_short(joints), labels, "")
+    for own_names, names, how in sides:
+        exact = [[i for i, label in enumerate(names) if same_joint(label, joint)] for joint in own_names]
+        if all(len(found) == 1 for found in exact):
+            return [found[0] for found in exact], f"by name{how}"
     mine, given = numbers_of(joints), numbers_of(labels)
     if mine and given:  # each may count from 0 or from 1
         shifts = {0, min(mine) - min(given)} if {min(mine), min(given)} == {0, 1} else {0}
@@ -205,6 +208,15 @@ def columns_of(joints: Sequence[str], labels: Sequence[str]) -> tuple[list[int],
     if not own or not theirs or len(set(own)) < len(joints) or len(set(theirs)) < len(labels):
         return None
     return ([theirs.index(at) for at in own], "by leg and part") if set(own) <= set(theirs) else None
+
+
+def _short(names: Sequence[str]) -> list[str]:
+    """Return names without the words that all of them begin with, such as ``ur5e`` of ``ur5e_elbow_joint``."""
+    words = [_words(name) for name in names]
+    shared = 0
+    while len(words) > 1 and len({tuple(w[: shared + 1]) for w in words}) == 1 and shared < len(words[0]):
+        shared += 1
+    return ["_".join(w[shared:]) for w in words]
 
 
 def _legs(names: Sequence[str]) -> list[tuple[str, int]]:

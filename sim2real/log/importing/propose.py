@@ -297,7 +297,9 @@ class Proposal:
         if ("actuator", "goal", "source") in self.questions:
             return command, True
         for joints in (measured.labels, self.joints):
-            if all(joints) and any(command.labels) and (found := columns_of(joints, command.labels)) is not None:
+            found = columns_of(joints, command.labels) if all(joints) and any(command.labels) else None
+            # Without a prefix or a stem the left arm is the right one.
+            if found is not None and (found[1] in ("by name", "by leg and part") or are_numbers(command.labels)):
                 if found[1] != "by name":
                     self.evidence.append(f"commands belong to positions {found[1]}")
                 return command.taken(found[0]), True
@@ -403,6 +405,13 @@ class Proposal:
             if self.hints.unit == "hundredths" and calibration is None:
                 raise UsageError("hundredths of a joint's range need LeRobot's calibration", hint="--calibration FILE")
             names = names or signal.sources
+            if calibration and self.hints.unit in lerobot.UNITS and not self.hints.as_told:
+                unit = lerobot.unit_of(calibration, signal.labels, signal.values)
+                if unit not in (None, self.hints.unit):
+                    raise UsageError(
+                        f"{signal.name!r} holds whole counts of the calibration in {unit}, not in {self.hints.unit}",
+                        hint=f"--unit {unit}; --as-told imports it all the same",
+                    )
             hers = self.table.robot or (self.hints.unit == "deg" and all(name.endswith(".pos") for name in names))
             if hers and not calibration and (jaws := list(filter(lerobot.is_gripper, signal.labels))):
                 raise UsageError(

@@ -35,7 +35,7 @@ def run(config: ImportConfig) -> None:
             open questions.
     """
     with _busy("read"):
-        sets = [open_tables(path, config.episode) for path in config.files]
+        sets = [_long_enough(open_tables(path, config.episode)) for path in config.files]
     if config.together and len(sets) > 1:
         sets = [[joined([table for tables in sets for table in tables])]]
     if config.out is not None and len(sets[0]) > 1:
@@ -88,6 +88,14 @@ def run(config: ImportConfig) -> None:
             wrote(written)
             note(f"the next file of this recorder: sim2real import FILE --mapping {shown(written)}")
             text = ""
+
+
+def _long_enough(tables: list[Table]) -> list[Table]:
+    """Return the episodes of a data set that can be checked; all, if none can."""
+    kept = [t for t in tables if max((len(v) for v in t.columns.values() if v.ndim), default=0) >= checks.LEAST]
+    if 0 < len(kept) < len(tables):
+        note(f"left out: {len(tables) - len(kept)} of {len(tables)} episodes have fewer than {checks.LEAST} samples")
+    return kept or tables
 
 
 def _busy(what: str) -> AbstractContextManager[Any]:
