@@ -1,12 +1,13 @@
 """The messages between the nodes of a robot, and their fields as columns."""
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sim2real import pytree
 from sim2real.graph.base import Base
+from sim2real.graph.delays import DelayDistribution
 from sim2real.types import Array, PyTree
 
 
@@ -66,6 +67,24 @@ class EpisodeStart(Base):
 
 States = tuple[np.ndarray, dict[str, np.ndarray]]
 """Times ``(N,)`` [s], and columns: states ``(N,)``, and the commands, one a step."""
+
+
+class Trials(NamedTuple):
+    """Episodes of a policy that are simulated beside those on the robot.
+
+    Attributes:
+        parameters: Parameters and delays of each simulation; simulation e does trial ``e % len(rest)``.
+        computation: Node -> distribution of its computation time.
+        rest: The measured positions ``(channels,)`` at the start of each trial.
+        duration_s: Length of an episode [s].
+        node: The node whose states are scored: the world, or the sensor.
+    """
+
+    parameters: Sequence[Mapping[str, float]]
+    computation: Mapping[str, DelayDistribution]
+    rest: Sequence[np.ndarray]
+    duration_s: float
+    node: str
 
 
 def as_columns(fields: Mapping[str, PyTree]) -> dict[str, np.ndarray]:

@@ -26,7 +26,7 @@ from sim2real.later import jax
 from sim2real.policy.contract import ActionTerm, ObservationTerm, observation_size
 from sim2real.robots.agent import PolicyAgent
 from sim2real.robots.loop import WORLD, Draw
-from sim2real.robots.messages import EpisodeStart, States
+from sim2real.robots.messages import EpisodeStart, States, Trials
 from sim2real.robots.probe import Probe
 from sim2real.robots.training import IdentifiableLoop
 from sim2real.training.environment.tasks import Rewards
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from sim2real.artifacts.bundle import Bundle
     from sim2real.artifacts.identification import Noise
     from sim2real.emulation.robot import Emulation, VirtualTime
-    from sim2real.graph.delays import DelayDistribution
     from sim2real.hardware.device import Device, Following, Reading
     from sim2real.hardware.joint import Joint
     from sim2real.hardware.safety.gate import GateConfig, GateLimits
@@ -331,31 +330,15 @@ class Robot(RecordedRobot):
     def exported(self, values: Mapping[str, Scalar]) -> Exported | None:
         return self.model.exported(values)
 
-    def simulated(
-        self,
-        bundle: Bundle,
-        parameters: Sequence[Mapping[str, float]],
-        computation: Mapping[str, DelayDistribution],
-        rest: Sequence[np.ndarray],
-        duration_s: float,
-        node: str,
-    ) -> list[tuple[States, States]]:
-        """Return simulations of a policy from where the robot rested; default: in the compiled graph.
+    def simulated(self, bundle: Bundle, trials: Trials) -> list[tuple[States, States]]:
+        """Return for each simulation the states of the scored node, and those of the sensor.
 
-        Args:
-            parameters: Parameters and delays of each simulation; simulation e does trial ``e % len(rest)``.
-            computation: Node -> distribution of its computation time.
-            rest: The measured positions ``(channels,)`` at the start of each trial.
-            node: The world, or the sensor.
-
-        Returns:
-            For each simulation the states of the node, and those of the sensor.
+        Default: in the compiled graph, from where the robot rested.
         """
         from sim2real.robots.training import simulate
         from sim2real.training.networks.policy import Policy
 
-        policy = Policy.from_weights(bundle.weights, bundle.spec)
-        return simulate(self, policy, parameters, computation, rest, duration_s, node)
+        return simulate(self, Policy.from_weights(bundle.weights, bundle.spec), trials)
 
 
 PARTS: Mapping[str, type] = {

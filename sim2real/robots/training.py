@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Unpack
 
@@ -32,7 +32,7 @@ from sim2real.robots.loop import (
     split_delay,
     split_drawn_delay,
 )
-from sim2real.robots.messages import EpisodeStart, States, as_columns, as_sent
+from sim2real.robots.messages import EpisodeStart, States, Trials, as_columns, as_sent
 from sim2real.robots.nodes import SimActuator, SimSensor
 from sim2real.training.environment.tasks import Rewards, TrainingTask
 from sim2real.types import Array, PyTree, Scalar
@@ -124,21 +124,14 @@ def simulation_params(
     return node_parameters(robot, values, start, policy)
 
 
-def simulate(
-    robot: Robot,
-    policy: PyTree,
-    parameters: Sequence[Mapping[str, float]],
-    computation: Mapping[str, DelayDistribution],
-    rest: Sequence[np.ndarray],
-    duration_s: float,
-    node: str,
-) -> list[tuple[States, States]]:
+def simulate(robot: Robot, policy: PyTree, trials: Trials) -> list[tuple[States, States]]:
     """Return simulations of a policy in one compiled graph; see ``Robot.simulated``."""
     from sim2real.graph.schedule import draw
     from sim2real.graph.windows import make_room
     from sim2real.runtime.compiled.graph import CompiledGraph
 
     # Draw the timelines.
+    parameters, computation, rest, duration_s, node = trials
     nodes, _ = training_loop(robot, parameters[0], {}, computation, True)
     if (solve_to_rest := getattr(nodes[WORLD], "solve_to_rest", None)) is not None:
         solve_to_rest()
@@ -150,8 +143,8 @@ def simulate(
     # Each simulation does the trial of its episode, from where the robot rested: friction holds it beside the task's
     # start, and a swing-up from there may go to the other side.
     episodes = [(e % len(rest), rest[e % len(rest)]) for e in range(count)]
-    trials = [simulation_params(robot, v, policy, *e) for v, e in zip(parameters, episodes, strict=True)]
-    params = jax.tree_util.tree_map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *trials)
+    each = [simulation_params(robot, v, policy, *e) for v, e in zip(parameters, episodes, strict=True)]
+    params = jax.tree_util.tree_map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *each)
     recorded = tuple({node, SENSOR, AGENT, ACTUATOR})
 
     def rollout(eps: jax.Array, params: PyTree) -> PyTree:

@@ -14,7 +14,6 @@ from jax.core import Tracer
 from sim2real import pytree
 from sim2real.composer.physics.mjx import gate, stepping
 from sim2real.composer.physics.mjx.import_mjx import mjx
-from sim2real.composer.physics.mjx.warp import warp
 from sim2real.errors import UsageError
 from sim2real.graph.base import Base, Empty, GraphState, StepState
 from sim2real.graph.node import BaseWorld
@@ -55,14 +54,11 @@ class MjxWorld(BaseWorld):
     Args:
         rate: Ticks per second [Hz]; a tick is a whole number of the model's time steps.
         field: Field of that input's message: shape ``(nu,)`` [the actuators' unit].
-        impl: ``"jax"``, or ``"warp"``: MuJoCo Warp, in single precision and without derivatives.
-        nconmax: On Warp: contacts that there is room for, times the number of copies, which share it; default: a guess.
-        njmax: On Warp: rows of constraints that there is room for in each copy; default: a guess.
 
     Raises:
         UsageError: When the tick is no whole number of time steps, or the model asks for what MJX does otherwise:
             delays of its own (ignored or misplaced there; they belong to the graph), the no-slip solver, an integrator
-            that it does not have, springs without dampers; or when Warp cannot be had.
+            that it does not have, springs without dampers.
     """
 
     def __init__(
@@ -74,10 +70,6 @@ class MjxWorld(BaseWorld):
         field: str = "action",
         color: str | None = None,
         order: int | None = None,
-        *,
-        impl: str = "jax",
-        nconmax: int | None = None,
-        njmax: int | None = None,
     ) -> None:
         super().__init__(name, rate, color=color, order=order)
         self.derives = False
@@ -92,11 +84,9 @@ class MjxWorld(BaseWorld):
             )
         try:
             gate.check_model(model)
-            self._warp = warp.make_engine(model, impl, nconmax, njmax)
         except UsageError as error:
             raise UsageError(f"world {name!r}: {error.args[0]}", hint=error.hint) from None
-        self._engine: stepping.Engine = self._warp or stepping.JaxEngine()
-        self._mjx_model: mjx.Model = self._warp.model if self._warp else mjx.put_model(model, impl="jax")
+        self._mjx_model: mjx.Model = mjx.put_model(model, impl="jax")
         self._apart = False
         self.law: StepLaw | None = None
         """Fields of the model that a subclass sets before every physics step, from the state."""
@@ -111,8 +101,8 @@ class MjxWorld(BaseWorld):
         if self._apart:
             return Empty()
         params = (graph_state or GraphState()).params.get(self.name) or self.init_params(rng)
-        start = self._warp.start if self._warp else mjx.make_data(self.model, impl="jax")
-        return self._engine.forward(params.model, start.replace(qpos=params.qpos, qvel=params.qvel))
+        start = mjx.make_data(self.model, impl="jax").replace(qpos=params.qpos, qvel=params.qvel)
+        return stepping.JaxEngine().forward(params.model, start)
 
     def init_output(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> MjxState:
         """Return positions and velocities at the start."""
@@ -132,7 +122,7 @@ class MjxWorld(BaseWorld):
                 cast = lambda new, old: jnp.asarray(new, old.dtype)  # noqa: E731
                 data = data.replace(ctrl=cast(law[0], data.ctrl), qfrc_applied=cast(law[1], data.qfrc_applied))
                 model = stepping.with_fields(model, {n: cast(a, getattr(model, n)) for n, a in law[2].items()})
-            return self._engine.advance(model, data, legacy=False), None
+            return stepping.JaxEngine().advance(model, data, legacy=False), None
 
         data = once(data)[0] if self.substeps == 1 else jax.lax.scan(once, data, length=self.substeps)[0]
         return step_state.replace(state=data), MjxState(data.qpos, data.qvel)
@@ -158,8 +148,6 @@ class MjxWorld(BaseWorld):
             if getattr(type(self), name) is not getattr(MjxWorld, name):
                 kind = type(self).__name__
                 raise UsageError(f"world {self.name!r}: {kind}.{name} is its own, and may depend on the state")
-        if self._warp:
-            raise UsageError(f"world {self.name!r} is one of MuJoCo Warp's")
         self._apart = True
         return self.model
 

@@ -13,6 +13,7 @@ from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.timing import Timing
 from sim2real.graph.base import Base
 from sim2real.graph.episode import Episode, Steps
+from sim2real.robots.messages import Trials
 from sim2real.robots.training import simulate
 from sim2real.stages.deploy import simulation
 from sim2real.stages.load import load_robot
@@ -82,7 +83,7 @@ def test_simulated_measurements_are_compared_with_measurements():
     policy = Push(jnp.full(1, 1.5))
     # The robot rested beside the start of its task, a turn away.
     rest, (computation, _) = [np.array([3 * np.pi + 0.06])], Timing.of(episode).computation()
-    (t_s, world), (at_s, sensor) = simulate(robot, policy, [values], computation, rest, 0.6, "world")[0]
+    (t_s, world), (at_s, sensor) = simulate(robot, policy, Trials([values], computation, rest, 0.6, "world"))[0]
     assert float(sensor["th"][0]) == pytest.approx(np.pi + 0.06, abs=1e-4)
     assert set(sensor) == set(world) == {"th", "thdot", "command", "t_command"}
     assert len(sensor["th"]) == len(at_s) < len(t_s)

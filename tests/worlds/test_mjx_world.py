@@ -83,29 +83,3 @@ def test_a_rollout_is_that_of_c_mujoco_under_the_same_commands():
 def test_what_mjx_would_do_otherwise_is_refused(model, rate, match):
     with pytest.raises(UsageError, match=match):
         MjxWorld("world", rate, model)
-
-
-@pytest.mark.night
-def test_the_same_graph_runs_on_warp():
-    """Started in one program and run in another, which gives every copy a model of its own."""
-    pytest.importorskip("warp", reason="Warp is not installed: the extra warp")
-
-    def play(impl):
-        world = MjxWorld("world", 100.0, arm(), impl=impl)
-        agent = Waves("actuator", 50.0, delay_dist=0.003)
-        world.connect(agent, skip=True, delay_dist=0.012)
-        nodes = {"actuator": agent, "world": world}
-        graph = CompiledGraph(nodes, "actuator", draw(nodes, 0.3, episodes=2))
-
-        def start(damping, eps):
-            params = world.init_params()
-            model = params.model.replace(dof_damping=damping * params.model.dof_damping)
-            return graph.init(jax.random.key(0), {"world": params.replace(model=model)}, eps=eps)
-
-        states = jax.jit(jax.vmap(start))(jnp.array([1.0, 4.0]), jnp.arange(2))
-        last = jax.jit(jax.vmap(lambda gs: graph.rollout(gs)[0].state["world"].qpos))
-        return np.asarray(last(states))
-
-    mine, theirs = play("warp"), play("jax")
-    np.testing.assert_allclose(mine, theirs, atol=1e-5)
-    assert np.abs(mine[0] - mine[1]).max() > 1e-3

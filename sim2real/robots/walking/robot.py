@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import copy
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, ClassVar
 
 import jax
-import numpy as np
 
 from sim2real.emulation.body import Terrain
 from sim2real.robots.loop import DELAYS
-from sim2real.robots.messages import States
+from sim2real.robots.messages import States, Trials
 from sim2real.robots.robot import Robot
 from sim2real.robots.walking.drive import LegMotors, WalkingDrive
 from sim2real.robots.walking.stand import LegsInAStand
@@ -24,7 +23,6 @@ from sim2real.robots.walking.world import WalkingModel
 
 if TYPE_CHECKING:
     from sim2real.artifacts.bundle import Bundle
-    from sim2real.graph.delays import DelayDistribution
 
 
 class ComposedRobot(Robot):
@@ -92,19 +90,11 @@ class ComposedRobot(Robot):
     def identifiable(self, max_delay_s: float) -> LegsInAStand:
         return LegsInAStand(self, max_delay_s)
 
-    def simulated(
-        self,
-        bundle: Bundle,
-        parameters: Sequence[Mapping[str, float]],
-        computation: Mapping[str, DelayDistribution],
-        rest: Sequence[np.ndarray],
-        duration_s: float,
-        node: str,
-    ) -> list[tuple[States, States]]:
+    def simulated(self, bundle: Bundle, trials: Trials) -> list[tuple[States, States]]:
         """Return one episode of each trial in C MuJoCo: its graph takes over ten minutes to compile on a processor."""
-        del computation, node
         from sim2real.robots.walking.twin import episode
 
-        runner, nominal = bundle.runner(), self.nominal()
-        played = [episode(self, runner, nominal | dict(parameters[i]), i, duration_s) for i in range(len(rest))]
+        runner, nominal, length_s = bundle.runner(), self.nominal(), trials.duration_s
+        values = [nominal | dict(row) for row in trials.parameters[: len(trials.rest)]]
+        played = [episode(self, runner, row, number, length_s) for number, row in enumerate(values)]
         return [(states, states) for states in played]

@@ -27,8 +27,8 @@ STEP_S = 0.002
 """Time step of the twin's physics, shorter than that of training [s]."""
 _REACH_M = 30.0
 """Rough ground in each direction from the start: an episode's way, with pushes [m]."""
-_SETTLED_S = 1.0
-"""Time after a new command that does not count [s]."""
+_SETTLED_S, _PUSHED_S = 1.0, 5.0
+"""Time after a new command or a push that does not count; time from push to push [s]."""
 
 
 class Walked(NamedTuple):
@@ -135,14 +135,13 @@ def walk(
     command: Callable[[float], np.ndarray],
     seconds: float,
     push_m_s: float = 0.0,
-    every_s: float = 5.0,
     shown: Callable[[Twin, float], None] | None = None,
 ) -> Walked:
     """Let a bundle's runner walk on a twin, in numpy, as the agent's node does.
 
     Args:
         command: Time -> commanded velocity ``(3,)``.
-        push_m_s: Size of a push every ``every_s`` [m/s].
+        push_m_s: Size of a push every 5 s [m/s].
         shown: Called after each policy step.
     """
     robot, period_s = twin.robot, 1.0 / twin.robot.drive.rate_hz
@@ -168,7 +167,7 @@ def walk(
         qpos[i] = twin.data.qpos
         if i and not np.array_equal(wanted[i], wanted[i - 1]):
             changed_s = t_s
-        if push_m_s and (i + 1) % round(every_s / period_s) == 0:
+        if push_m_s and (i + 1) % round(_PUSHED_S / period_s) == 0:
             twin.push(push_m_s)
             changed_s = t_s
         settled[i] = t_s - changed_s >= _SETTLED_S

@@ -15,7 +15,7 @@ from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode, named_leaves
 from sim2real.installation import has_jax
 from sim2real.robots.loop import ACTUATOR, AGENT, DELAYS, SENSOR, WORLD
-from sim2real.robots.messages import States, as_columns, as_sent
+from sim2real.robots.messages import States, Trials, as_columns, as_sent
 from sim2real.robots.robot import Robot
 from sim2real.stages.terminal.console import note, progress
 from sim2real.stages.terminal.interruption import patiently
@@ -109,7 +109,8 @@ def _simulated(
         computation, hiccups = recordings[0].timing.computation(1.0 / robot.drive.rate_hz)
         rest = [_rest(robot, recording.episode) for recording in recordings]
         with progress(None, "simulate the same"):
-            pairs = patiently(lambda: robot.simulated(bundle, parameters, computation, rest, duration_s, node))
+            trials = Trials(parameters, computation, rest, duration_s, node)
+            pairs = patiently(lambda: robot.simulated(bundle, trials))
     except Sim2RealError as error:
         note(f"warning: nothing to compare with: {error.args[0]}")
         return []

@@ -66,24 +66,24 @@ def recordings_of(value: Any, robot: RecordedRobot, name: str = "recording") -> 
     return recordings
 
 
-def identification_of(value: Any, name: str = "identification") -> Identification:
+def identification_of(value: Any) -> Identification:
     """Return an identification, or that of a file or folder.
 
     Raises:
         UsageError: It is something else, such as values alone, which have no uncertainty.
     """
     hint = "sim2real.Identification.load(FOLDER) opens one; values alone have no intervals, timing and verdict"
-    return _loaded(value, Identification, name, "an Identification, or its folder or file", hint)
+    return _loaded(value, Identification, "identification", "an Identification, or its folder or file", hint)
 
 
-def bundle_of(value: Any, name: str = "bundle") -> Bundle:
+def bundle_of(value: Any) -> Bundle:
     """Return a policy bundle, or that of a folder."""
-    return _loaded(value, Bundle, name, "a Bundle, or its folder", "sim2real.Bundle.load(FOLDER) opens one")
+    return _loaded(value, Bundle, "bundle", "a Bundle, or its folder", "sim2real.Bundle.load(FOLDER) opens one")
 
 
-def timing_of(value: Any, name: str = "timing") -> Timing:
+def timing_of(value: Any) -> Timing:
     """Return a timing, or that of a file or folder."""
-    return _loaded(value, Timing, name, "a Timing, or its file", "recording.timing is one")
+    return _loaded(value, Timing, "timing", "a Timing, or its file", "recording.timing is one")
 
 
 def folder_of(value: Any, name: str = "folder") -> Path:
