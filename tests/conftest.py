@@ -2,6 +2,7 @@
 
 import gc
 import os
+import shutil
 import signal
 import sys
 from importlib import metadata
@@ -94,6 +95,4 @@ def finished_run_dir(shared_run_dir):
 @pytest.fixture
 def run_copy(finished_run_dir, tmp_path):
     """A copy of the finished run that the test may change, in a folder of runs of its own."""
-    import shared_run
-
-    return shared_run.copied(finished_run_dir, tmp_path / "runs" / "pendulum" / finished_run_dir.name)
+    return Path(shutil.copytree(finished_run_dir, tmp_path / "runs" / "pendulum" / finished_run_dir.name))

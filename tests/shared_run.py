@@ -7,7 +7,6 @@ which is simulated by hand: a recording of 12 s takes milliseconds, and a busy m
 from __future__ import annotations
 
 import fcntl
-import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
@@ -97,7 +96,7 @@ def write(log: Path, truth: Path, played: hidden.Played) -> dict[str, Any]:
 
 
 def shared(base: Path) -> Path:
-    """Return the session's run folder, which the first process to come makes and makes read-only.
+    """Return the session's run folder, which the first process to come makes.
 
     Args:
         base: Folder that all processes of the session share.
@@ -106,7 +105,6 @@ def shared(base: Path) -> Path:
     with locked(base / "shared_run.lock"):
         if not (base / "shared_run.finished").is_file():
             make(root)
-            protect(root)
             (base / "shared_run.finished").touch()
     (run_dir,) = (root / "pendulum").iterdir()
     return run_dir
@@ -120,29 +118,7 @@ def locked(path: Path) -> Iterator[None]:
         yield
 
 
-def protect(root: Path) -> None:
-    """Take the permission to write from all files and folders below ``root``."""
-    for folder, _, files in os.walk(root):
-        for name in files:
-            (Path(folder) / name).chmod(0o444)
-        Path(folder).chmod(0o555)
-
-
 def state(folder: Path) -> dict[str, tuple[int, int]]:
-    """Return size and time of change [ns] of every file and folder below a folder.
-
-    A process of the user root writes in spite of missing permissions: the fixture compares states around each test.
-    """
+    """Return size and time of change [ns] of every file and folder below a folder: the fixture compares them."""
     about = {path: path.stat() for path in (folder, *folder.rglob("*"))}
     return {str(path): (found.st_size, found.st_mtime_ns) for path, found in about.items()}
-
-
-def copied(run_dir: Path, target: Path) -> Path:
-    """Copy the run to a folder and return it: tests may write into the copy."""
-    for path in (run_dir, *run_dir.rglob("*")):
-        at = target / path.relative_to(run_dir)
-        if path.is_dir():
-            at.mkdir(parents=True)
-        else:
-            at.write_bytes(path.read_bytes())
-    return target

@@ -12,7 +12,7 @@ from random_models import names
 from sim2real import composer
 from sim2real.composer import mjcf
 from sim2real.composer.mjcf.files import Asset, renamed_skin
-from sim2real.errors import UsageError
+from sim2real.errors import Sim2RealError, UsageError
 
 
 @pytest.mark.parametrize("part", [0, *(pytest.param(part, marks=pytest.mark.night) for part in range(1, 50))])
@@ -95,6 +95,67 @@ def test_text_names_what_is_there_when_the_world_is_compiled():
         site.xpos = [0, 0, 1]  # derived
     with pytest.raises(AttributeError, match="rgba"):
         _ = site.rgbaa
+
+
+def named(elements):
+    return [e.name for e in elements]
+
+
+SAME = {
+    "by name and number": lambda m: [m.worldbody.body["c"].name, m.worldbody.body[-1].name, len(m.worldbody.body)],
+    "slices": lambda m: named(m.worldbody.body[1:]),
+    "deleting by number": lambda m: [m.worldbody.body.__delitem__(0), named(m.worldbody.body)],
+    "deleting by name": lambda m: [m.worldbody.body.__delitem__("c"), named(m.worldbody.body)],
+    "clearing": lambda m: [m.worldbody.body.clear(), named(m.find_all("body"))],
+    "deleting an attribute": lambda m: [delattr(m.find("geom", "g"), "size"), m.find("geom", "g").size],
+    "numbers as text": lambda m: [setattr(m.find("geom", "g"), "pos", "1 2 3"), m.find("geom", "g").pos.tolist()],
+    "one number for many": lambda m: [setattr(m.find("geom", "g"), "size", 0.5), m.find("geom", "g").size.tolist()],
+    "moving a child": lambda m: [m.worldbody.insert("body", 0, name="first"), named(m.worldbody.body)][1:],
+    "whole frames": lambda m: m.attach(m.__class__(model="x")).full_identifier,
+}
+REFUSED = {
+    "a slash in a name": lambda m, kit: m.worldbody.add("body", name="a/b"),
+    "the world's name": lambda m, kit: m.worldbody.add("body", name="world"),
+    "a name that is taken": lambda m, kit: m.worldbody.add("body", name="b"),
+    "an unknown child": lambda m, kit: m.worldbody.add("bodies"),
+    "an unknown list": lambda m, kit: m.worldbody.get_children("bodies"),
+    "a child of a frame": lambda m, kit: m.attach(m.__class__(model="x")).add("geom", size=[0.1]),
+    "a second of what is there once": lambda m, kit: (
+        m.find("body", "b").add("inertial") and m.find("body", "b").add("inertial")
+    ),
+    "no kind": lambda m, kit: m.find("thing", "b"),
+    "no name": lambda m, kit: m.find("body", 3),
+    "a number that is not there": lambda m, kit: m.worldbody.body[7],
+    "a list's deletion": lambda m, kit: delattr(m.worldbody, "body"),
+    "an unknown attribute's deletion": lambda m, kit: delattr(m.find("geom", "g"), "colour"),
+    "detaching the top": lambda m, kit: m.detach(),
+    "attaching to a body": lambda m, kit: m.find("body", "b").attach(m.__class__(model="x")),
+    "two dimensions": lambda m, kit: setattr(m.find("geom", "g"), "pos", [[1, 2, 3]]),
+    "too many numbers": lambda m, kit: setattr(m.find("geom", "g"), "pos", [1, 2, 3, 4]),
+    "no number": lambda m, kit: setattr(m.find("geom", "g"), "mass", "heavy"),
+    "an element for a number": lambda m, kit: setattr(m.find("geom", "g"), "mass", m.find("body", "b")),
+    "an element of another kind": lambda m, kit: m.actuator.add("motor", joint=m.find("body", "b")),
+    "a number for an element": lambda m, kit: m.actuator.add("motor", joint=3),
+    "no XML": lambda m, kit: kit.mjcf.from_xml_string("<mujoco"),
+    "another document": lambda m, kit: kit.mjcf.from_xml_string("<robot/>"),
+    "a document's unknown child": lambda m, kit: kit.mjcf.from_xml_string("<mujoco><bodies/></mujoco>"),
+    "no file": lambda m, kit: kit.mjcf.from_path("nowhere.xml"),
+}
+
+
+def test_elements_are_read_and_changed_as_in_dm_control(oracle, ours):
+    for name, program in SAME.items():
+        assert program(robot()) == program(oracle.mjcf.from_xml_string(ROBOT.format(inside="", beside=""))), name
+    with pytest.raises(UsageError, match="contains '/'"):
+        robot().model = "a/b"  # which dm_control finds out later
+
+
+@pytest.mark.parametrize("program", REFUSED.values(), ids=REFUSED)
+def test_what_dm_control_refuses_is_refused_in_words(oracle, ours, program):
+    with pytest.raises(Exception):  # noqa: B017, PT011 - of any type
+        program(oracle.mjcf.from_xml_string(ROBOT.format(inside="", beside="")), oracle)
+    with pytest.raises((Sim2RealError, AttributeError, KeyError, IndexError)):
+        program(robot(), ours)
 
 
 # -- settings of several models

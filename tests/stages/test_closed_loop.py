@@ -6,6 +6,7 @@ test_loop.py runs the same plans with stages that only write files.
 """
 
 import importlib
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -53,7 +54,7 @@ def world(tmp_path, finished_run_dir):
 
     def first(name):
         run_dir = root / "pendulum" / finished_run_dir.name
-        shared_run.copied(finished_run_dir / name, run_dir / name)
+        shutil.copytree(finished_run_dir / name, run_dir / name)
         return finished(run_dir, name)
 
     def record(stage, config, run_dir):

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from live_robots import TINY, manifest_of
-from shared_run import copied, recorded
+from shared_run import recorded
 
 import sim2real
 from sim2real import cli
@@ -59,7 +59,7 @@ def test_a_resumed_run_is_complete(finished_run_dir):
 def test_a_run_that_was_copied_goes_on_without_its_origin(finished_run_dir, tmp_path, monkeypatch):
     """Neither the log nor anything outside of the run folder is needed to train, deploy, report and look at it."""
     run_dir = tmp_path / "elsewhere" / "pendulum" / "copy"
-    copied(finished_run_dir, run_dir)
+    shutil.copytree(finished_run_dir, run_dir)
     (run_dir / "record" / "session.mcap").unlink()
     monkeypatch.chdir(tmp_path)
     for path in run_dir.rglob("*.json"):
@@ -79,7 +79,7 @@ def test_a_run_that_was_copied_goes_on_without_its_origin(finished_run_dir, tmp_
 def test_training_on_what_is_not_accepted_must_be_asked_for(finished_run_dir, tmp_path, capsys):
     """And ``--explain`` shows what episodes are drawn from, and trains nothing."""
     run_dir = tmp_path / "pendulum" / "copy"
-    copied(finished_run_dir, run_dir)
+    shutil.copytree(finished_run_dir, run_dir)
     file = run_dir / "identify" / "parameters.json"
     document = json.loads(file.read_text())
     document["verdict"] = {"status": "change the model", "reasons": ["friction is at its bound"], "next": "widen it"}

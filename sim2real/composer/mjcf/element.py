@@ -572,12 +572,6 @@ class ElementList(Sequence[Element]):
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Sequence) and list(self) == list(other)
 
-    def __add__(self, other: Iterable[Element]) -> list[Element]:
-        return [*self, *other]
-
-    def __radd__(self, other: Iterable[Element]) -> list[Element]:
-        return [*other, *self]
-
     def __repr__(self) -> str:
         return repr(self._find())
 
