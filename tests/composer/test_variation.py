@@ -1,3 +1,5 @@
+import importlib
+
 import numpy as np
 import pytest
 
@@ -53,17 +55,47 @@ def test_a_biased_random_walk_has_its_deviation_and_timescale():
             distributions.BiasedRandomWalk(**options)
 
 
-@pytest.fixture
-def ball():
-    model = mjcf.from_xml_string(
-        """<mujoco><worldbody><body name="b"><joint name="j"/><geom name="g" size=".1" mass="2"/></body>
-          </worldbody></mujoco>"""
-    )
-    return model, model.find("geom", "g"), model.find("body", "b")
+BALL = """<mujoco><worldbody><body name="b"><joint name="j"/><geom name="g" size=".1" mass="2" pos="1 2 3"/></body>
+  </worldbody></mujoco>"""
 
 
-def test_the_compiled_model_varies_with_all_that_follows_from_it(ball):
-    model, _, body = ball
+def test_models_vary_from_their_initial_values_as_in_dm_control(oracle, ours):
+    """Bound, applied twice, moved by hand, bound anew, unbound and cleared."""
+    found = []
+    for package, kit in (("dm_control", oracle), ("sim2real", ours)):
+        drawn = importlib.import_module(f"{package}.composer.variation.distributions")
+        noise = importlib.import_module(f"{package}.composer.variation.noises")
+        geom, rng = kit.mjcf.from_xml_string(BALL).find("geom", "g"), RNG(3)
+        variator, seen = kit.variation.MJCFVariator(), []
+
+        def apply(variator=variator, seen=seen, geom=geom, rng=rng):
+            variator.apply_variations(rng)
+            seen.append(
+                [float(geom.mass), *geom.pos.tolist(), None if geom.friction is None else geom.friction.tolist()]
+            )
+
+        variator.bind_attributes(geom, mass=noise.Multiplicative(drawn.Uniform(1, 2)), friction=[0.5, 0.1])
+        variator.bind_attributes(
+            geom, pos=noise.Additive(drawn.UniformPointOnSphere(single_sample=True), cumulative=True)
+        )
+        for _ in range(2):
+            apply()
+        geom.mass = 7.0
+        apply()
+        variator.reset_initial_values()
+        apply()
+        variator.bind_attributes(geom, mass=None, pos=noise.Additive(0.5))
+        apply()
+        variator.clear()
+        apply()
+        found.append(seen)
+    assert found[0] == found[1]
+    assert len({tuple(map(str, row)) for row in found[1]}) == 5  # all but the last differ
+
+
+def test_the_compiled_model_varies_with_all_that_follows_from_it():
+    model = mjcf.from_xml_string(BALL)
+    body = model.find("body", "b")
     physics = mjcf.Physics.from_mjcf_model(model)
     before = physics.model.dof_invweight0.copy()
     variator = variation.PhysicsVariator()

@@ -33,6 +33,8 @@ _COLUMNS = {
 class NamedArray(NDArrayOperatorsMixin):
     """One array whose rows are indexed by numbers, names or elements; otherwise it is that array.
 
+    A list of rows beside a list of columns gives pairs, as in numpy; ``np.ix_`` gives all combinations.
+
     A name that is not there may leave out the models it is attached below, as long as only one element ends with it.
 
     Args:
@@ -90,11 +92,7 @@ class NamedArray(NDArrayOperatorsMixin):
         """
         if isinstance(key, tuple):
             row, *columns = key
-            row = self._rows(row)
-            columns = [_column(c) for c in columns]
-            if isinstance(row, np.ndarray) and row.ndim == 1 and columns and isinstance(columns[0], list):
-                return np.ix_(row, columns[0])
-            return (row, *columns)
+            return (self._rows(row), *map(_column, columns))
         return self._rows(key)
 
     def _rows(self, key: Index) -> Index:
@@ -106,7 +104,7 @@ class NamedArray(NDArrayOperatorsMixin):
             keys = list(key)
             if keys and isinstance(keys[0], str | Element):
                 return layout.index(self._model, self._field, tuple(self._number(k) for k in keys), False)
-            return keys
+            return np.asarray(keys) if keys else keys
         return key
 
     def _number(self, key: str | Element) -> int:
@@ -131,7 +129,7 @@ def _column(key: Index) -> Index:
     if isinstance(key, np.ndarray) and key.dtype.kind == "U":
         return np.reshape(_column(key.ravel().tolist()), key.shape)
     if isinstance(key, list):
-        return [_COLUMNS[k] if isinstance(k, str) else k for k in key]
+        return np.array([_COLUMNS[k] if isinstance(k, str) else k for k in key])
     return key
 
 
