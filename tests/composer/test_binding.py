@@ -16,28 +16,6 @@ def arm():
     return model, mjcf.Physics.from_mjcf_model(model)
 
 
-def test_parts_of_several_elements_are_written_through(arm):
-    model, physics = arm
-    joints, geoms = physics.bind(model.find_all("joint")), physics.bind(model.find_all("geom"))
-    qpos = joints.qpos
-    qpos[1] = 0.3
-    assert physics.data.qpos.tolist() == [0, 0.3]
-    geoms["pos", ["x", "z"]] = 0.5
-    np.testing.assert_array_equal(physics.model.geom_pos[:, [0, 2]], np.full((4, 2), 0.5))
-    geoms.pos[:, 0] *= 3
-    geoms.pos[1:, 2] += [0.1, 0.2, 0.3]
-    np.testing.assert_array_equal(physics.model.geom_pos[:, 0], np.full(4, 1.5))
-    np.testing.assert_allclose(geoms.pos[:, 2], [0.5, 0.6, 0.7, 0.8])
-    np.testing.assert_allclose(np.sort(physics.model.geom_pos[:, 2]), [0.5, 0.6, 0.7, 0.8])
-    sums = joints.qpos + 1
-    sums[0] = 9
-    assert physics.data.qpos[0] == 0
-    assert not geoms.element_id.flags.writeable
-    joint = model.find("joint", "shoulder")  # the functional view is the same physics
-    assert physics.set(joint, "qpos", [0.2]).write(joint, "qvel", 2.0, 0) is physics
-    assert (physics.get(joint, "qpos"), physics.get(joint, "qvel")) == (0.2, 2.0)
-
-
 def test_what_cannot_be_bound_is_named(arm):
     model, physics = arm
     joint = model.find("joint", "shoulder")
@@ -65,7 +43,7 @@ KEYS = {
     "xpos": ["a", 2, -1, ("b", "z"), (["a", "f"], "x"), (["f", "b"], ["x", "z"]), (slice(None), "y"),
              ("b", slice(1, 3)), np.ix_(["a", "f"], ["z", "x"]), np.array([3, 1]), [3, 1],
              np.array([True, False, True, False])],
-    "xmat": [("a", "yx"), ("b", ["xx", "zz"])],
+    "xmat": [("a", "yx"), ("b", ["xx", "zz"]), ("b", [True, False] * 4 + [True]), (["a", "b"], [["xx"], ["zz"]])],
     "xquat": [("a", "qw"), (["a", "b"], ["qx", "qz"])],
     "qpos": ["j", "ball", "free", ["j", "free"], ("ball",)],
     "qvel": ["j", "ball", ["free", "ball"], slice(2, 5)],
@@ -94,6 +72,75 @@ def test_named_arrays_are_read_and_written_as_in_dm_control(oracle, ours):
         for one in physics:
             with pytest.raises((KeyError, IndexError, AttributeError, TypeError)):
                 _ = getattr(one.named.data, name)[key]
+
+
+def change(array, index, value):
+    array[index] = value
+
+
+BOUND = {
+    "one": lambda b: [b("geom", "g").pos, b("geom", "g")["pos", "x"], b("joint", "j").qpos, b("body", "a").mass],
+    "several": lambda b: [b("geom", "gh").pos, b("geom", "gh")["pos", ["x", "z"]], b("geom", "hg")["rgba", ["a", "r"]]],
+    "frames": lambda b: [
+        b("body", "ab").xquat,
+        b("body", "a")["xmat", "yx"],
+        b("site", "s").xpos,
+        b("body", "fa").xpos,
+    ],
+    "widths": lambda b: [b("joint", ["ball", "j"]).qpos, b("joint", ["j", "free"]).qvel, b("joint", ["ball"]).damping],
+    "sensors": lambda b: [b("sensor", ["three", "one"]).sensordata, b("actuator", "u").ctrl],
+    "numbers": lambda b: [b("geom", "hg").element_id, b("geom", "g").element_id],
+    "nothing": lambda b: [b("geom", []).pos, b("geom", []).element_id],
+    "set one": lambda b: [setattr(b("geom", "g"), "pos", [1, 2, 3]), setattr(b("joint", "j"), "qpos", 0.3)],
+    "set several": lambda b: [setattr(b("geom", "gh"), "pos", 0.5), setattr(b("joint", ["ball", "j"]), "qvel", 0.1)],
+    "set rows": lambda b: [setattr(b("geom", "hg"), "pos", [[1, 2, 3], [4, 5, 6]])],
+    "set columns": lambda b: [
+        change(b("geom", "gh"), ("pos", ["x", "z"]), 0.5),
+        change(b("geom", "g"), ("pos", "y"), 7),
+    ],
+    "set parts": lambda b: [
+        change(b("geom", "gh").pos, (slice(None), 0), 9),
+        change(b("joint", ["free", "j"]).qpos, 2, 5),
+    ],
+    "add": lambda b: [b("geom", "gh").pos.__iadd__([0.1, 0.2, 0.3]), b("joint", ["ball", "j"]).qvel.__imul__(2.0)],
+    "copies": lambda b: [b("joint", ["ball", "j"]).qpos + 1, change(b("joint", ["j"]).qpos.copy(), 0, 9)],
+    "mass": lambda b: [setattr(b("body", "a"), "mass", 3.0), b("body", "abf").mass],
+    "another kind": lambda b: b("geom", "g").qpos,
+    "no columns": lambda b: b("geom", "g")["pos", "w"],
+    "another shape": lambda b: setattr(b("geom", "gh"), "pos", [1.0, 2.0]),
+    "numbers are constant": lambda b: change(b("geom", "gh").element_id, 0, 3),
+    "an empty one": lambda b: setattr(b("geom", []), "pos", 1.0),
+}
+
+
+@pytest.mark.parametrize("program", BOUND.values(), ids=BOUND)
+def test_bound_elements_are_read_and_written_as_in_dm_control(oracle, ours, program):
+    found = []
+    for kit in (oracle, ours):
+        model = kit.mjcf.from_xml_string(MIXED)
+        physics = kit.mjcf.Physics.from_mjcf_model(model)
+        physics.data.qpos[:], physics.data.qvel[:] = np.linspace(0.1, 1.2, 12), np.linspace(1.0, 2.0, 10)
+        physics.forward()
+
+        def bind(kind, names, model=model, physics=physics):
+            listed = [model.find(kind, name) for name in names]
+            return physics.bind(listed[0] if isinstance(names, str) and len(names) == 1 else listed)
+
+        try:
+            read = [None if value is None else np.array(value).tolist() for value in program(bind)]
+        except Exception:  # of any type
+            read = "refused"
+        physics.forward()
+        state = physics.model.geom_pos, physics.model.body_mass, physics.data.qpos, physics.data.qvel, physics.data.xpos
+        found.append((read, [np.array(array).tolist() for array in state]))
+    assert found[1] == found[0]
+
+
+def test_the_functional_view_is_the_same_physics(arm):
+    model, physics = arm
+    joint = model.find("joint", "shoulder")
+    assert physics.set(joint, "qpos", [0.2]).write(joint, "qvel", 2.0, 0) is physics
+    assert (physics.get(joint, "qpos"), physics.get(joint, "qvel")) == (0.2, 2.0)
 
 
 def test_named_arrays(arm):

@@ -259,12 +259,12 @@ class BaseBinding(ABC):
 
     def __getitem__(self, key: Index) -> PyTree:
         name, axes = key if isinstance(key, tuple) else (key, None)
-        return self.read(name) if axes is None else self._plain(self.read(name))[..., columns(axes)]
+        return self.read(name) if axes is None else self._plain(self.read(name))[..., layout.columns(axes)]
 
     def __setitem__(self, key: Index, value: ArrayLike) -> None:
         name, axes = key if isinstance(key, tuple) else (key, None)
         if axes is not None:
-            value = updated(self._physics.np, self.read(name), (..., columns(axes)), value)
+            value = updated(self._physics.np, self.read(name), (..., layout.columns(axes)), value)
         self.write(name, value)
 
     def _plain(self, array: PyTree) -> Array:
@@ -301,13 +301,3 @@ def updated(xp: ArrayModule, array: PyTree, index: Index, value: ArrayLike) -> A
     array = np.array(array)
     array[index] = value
     return array
-
-
-def columns(key: Index) -> Index:
-    """Return column numbers for names of axes such as ``'x'`` or ``['x', 'z']``."""
-    axes = {name: i for i, name in enumerate("xyz")}
-    if isinstance(key, str):
-        return axes[key]
-    if isinstance(key, list | tuple):
-        return [axes[k] if isinstance(k, str) else k for k in key]
-    return key

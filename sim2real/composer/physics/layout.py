@@ -15,7 +15,7 @@ from sim2real.composer.mjcf.schema import mj
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
-    from sim2real.composer.types import MjModel
+    from sim2real.composer.types import Index, MjModel
 
 TRIGGERS = {"qpos", "qvel", "act", "ctrl", "qfrc_applied", "xfrc_applied", "mocap_pos", "mocap_quat", "eq_active"}
 """Fields of the data whose change makes everything computed from them out of date."""
@@ -32,6 +32,29 @@ DISABLED_BY = {
     "body_iquat": ("body_simple", "body_sameframe"),
 }
 """Shortcuts of MuJoCo's that must be switched off when a field is written: they would hide the new value."""
+
+
+COLUMNS = {
+    **{name: i for i, name in enumerate(("x", "y", "z"))},
+    **{name: i for i, name in enumerate(("xx", "xy", "xz", "yx", "yy", "yz", "zx", "zy", "zz"))},
+    **{name: i for i, name in enumerate(("qw", "qx", "qy", "qz"))},
+    **{name: i for i, name in enumerate("rgba")},
+}
+"""Names of the columns of vectors, matrices, quaternions and colours."""
+
+
+def columns(key: Index) -> Index:
+    """Return the numbers of columns for a name such as ``'x'``, or for a list or an array of names."""
+    if isinstance(key, str):
+        if key not in COLUMNS:
+            raise KeyError(f"there is no column {key!r}. Available: {', '.join(COLUMNS)}")
+        return COLUMNS[key]
+    if isinstance(key, list | tuple | np.ndarray):
+        array = np.asarray(key)
+        if array.dtype.kind == "U":
+            return np.array([columns(k) if isinstance(k, str) else k for k in np.ravel(key)]).reshape(array.shape)
+        return array
+    return key
 
 
 @dataclass(frozen=True)

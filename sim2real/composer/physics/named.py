@@ -22,12 +22,6 @@ if TYPE_CHECKING:
     from sim2real.types import PyTree
 
 _KIND_OF_SIZE = {size: name for name, kind in layout.KINDS.items() for size in kind.sizes}
-_COLUMNS = {
-    **{name: i for i, name in enumerate(("x", "y", "z"))},
-    **{name: i for i, name in enumerate(("xx", "xy", "xz", "yx", "yy", "yz", "zx", "zy", "zz"))},
-    **{name: i for i, name in enumerate(("qw", "qx", "qy", "qz"))},
-    **{name: i for i, name in enumerate("rgba")},
-}
 
 
 class NamedArray(NDArrayOperatorsMixin):
@@ -92,7 +86,7 @@ class NamedArray(NDArrayOperatorsMixin):
         """
         if isinstance(key, tuple):
             row, *columns = key
-            return (self._rows(row), *map(_column, columns))
+            return (self._rows(row), *map(layout.columns, columns))
         return self._rows(key)
 
     def _rows(self, key: Index) -> Index:
@@ -121,16 +115,6 @@ class NamedArray(NDArrayOperatorsMixin):
         what = "is ambiguous" if ending else "is not there"
         available = ", ".join(names[i] for i in ending) if ending else ", ".join(names)
         raise KeyError(f"{self._field.name}: {kind} {name!r} {what}. Available: {available}")
-
-
-def _column(key: Index) -> Index:
-    if isinstance(key, str):
-        return _COLUMNS[key]
-    if isinstance(key, np.ndarray) and key.dtype.kind == "U":
-        return np.reshape(_column(key.ravel().tolist()), key.shape)
-    if isinstance(key, list):
-        return np.array([_COLUMNS[k] if isinstance(k, str) else k for k in key])
-    return key
 
 
 class NamedFields:
