@@ -83,7 +83,7 @@ GYM = [topologies.robot, topologies.unequal_rates, topologies.policy_with_hiccup
        topologies.slow_supervisor]  # fmt: skip
 
 
-@pytest.mark.parametrize("topology", some_at_night(GYM, topologies.slow_supervisor))
+@pytest.mark.parametrize("topology", some_at_night(GYM, topologies.slow_supervisor, topologies.slow_world))
 def test_steps_show_what_the_supervisor_would_have_seen(topology, compiled):
     graph = compiled(topology)
     supervisor = graph.supervisor

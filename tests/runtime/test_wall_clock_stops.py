@@ -233,7 +233,7 @@ def test_calls_honour_their_timeouts(clock):
         graph.reset(gs)
     assert clock.monotonic_s() - begin == pytest.approx(0.3, abs=0.01)
     assert graph.wait(0.1) is False
-    with pytest.raises(GraphTimeout, match="'sensor' is still in its step 0"):
+    with pytest.raises(GraphTimeout, match=r"'sensor' is still in its step 0 0\.2 s after the stop"):
         graph.stop(timeout_s=0.2)
     assert clock.monotonic_s() - begin == pytest.approx(0.6, abs=0.01)
     assert sensor.calls == ["startup", "stop"]
