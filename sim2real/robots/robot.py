@@ -315,6 +315,7 @@ class Robot(RecordedRobot):
     drive: RobotDrive
     task: RobotTask
     model: RobotModel
+    _world: str | None = None
 
     @property
     def units(self) -> Mapping[str, str]:
@@ -401,12 +402,12 @@ def in_world(robot: AnyRobot, name: str | None) -> AnyRobot:
     """Return a robot in the world of a name: an installed package provides its model.
 
     Args:
-        name: The world; None: the robot's own.
+        name: The world; None: the robot's own. A robot that is in this world already stays as it is.
 
     Raises:
         UsageError: There is no such world, or the robot cannot use another world.
     """
-    if name is None:
+    if name is None or vars(robot).get("_world") == name:
         return robot
     if not isinstance(robot, Robot):
         raise UsageError(
@@ -421,7 +422,7 @@ def in_world(robot: AnyRobot, name: str | None) -> AnyRobot:
     if (node := model.make_world().name) != WORLD:
         raise UsageError(f"the node of world {name!r} is called {node!r}", hint=f"robots call it {WORLD!r}")
     robot = copy.copy(robot)
-    robot.model = model
+    robot.model, robot._world = model, name
     return robot
 
 

@@ -59,6 +59,7 @@ def test_another_world_has_its_own_parameters_and_the_robot_the_rest(table):
     assert in_world(table, None) is table
     oiled = checked(in_world(table, "oiled"), "here")
     assert isinstance(oiled, type(table))
+    assert in_world(oiled, "oiled") is oiled, "its model would have the drag twice"
     assert [p.name for p in oiled.model.dynamics()] == ["loop", "friction", "drag"]
     assert oiled.identifiable(0.05).parameters.names[2:] == ("drag", "actuator_delay")
     assert [p.name for p in table.model.dynamics()] == ["loop", "friction"]

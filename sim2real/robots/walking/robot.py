@@ -80,7 +80,7 @@ class ComposedRobot(Robot):
     def commanded(self, command: tuple[float, float, float]) -> ComposedRobot:
         """Return the robot with this command in all trials."""
         robot = copy.copy(self)  # with its name and defaults
-        robot.commands = replace(self.commands, fixed=command)
+        robot.commands, robot._world = replace(self.commands, fixed=command), None
         robot.__init__()
         return robot
 
