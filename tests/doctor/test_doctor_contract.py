@@ -11,7 +11,7 @@ from onnx import TensorProto, helper, numpy_helper
 from sim2real import cli
 from sim2real.doctor.contract import Contract, Policy, Term, contract_toml, read_policy
 from sim2real.doctor.log import read_deployment
-from sim2real.doctor.solve import solve_contract
+from sim2real.doctor.solve import mirror_of, solve_contract
 from sim2real.errors import UsageError
 from sim2real.graph.episode import StepRecord
 from sim2real.log.writer import SessionFile
@@ -152,6 +152,11 @@ def test_rows_without_times_that_fit_nothing_are_refused(signal: str, tmp_path: 
     np.savez(tmp_path / "log.npz", **log, **{signal: np.ones((40, 3))})
     with pytest.raises(UsageError, match=f"{signal} has 40 rows"):
         read_deployment(tmp_path / "log.npz", JOINTS)
+
+
+def test_mirrored_joints() -> None:
+    assert mirror_of(("left_knee_joint", "right_knee_joint", "waist")) == (1, 0, 2)
+    assert mirror_of(("shoulder", "elbow")) is None
 
 
 # -- descriptions

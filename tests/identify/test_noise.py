@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from sim2real.artifacts.identification import Noise
 from sim2real.identification.parameters import Parameter, ParameterTable
 from sim2real.identification.uncertainty import Linearised, above_noise, noises, widening
 
@@ -55,6 +56,12 @@ def test_residuals_are_above_the_noise_by_the_errors_of_the_model(slow, ratio):
 
 def linearised(raw, compared):
     return Linearised(raw, np.zeros((*raw.shape, 1)), np.eye(1), np.zeros(1), raw, compared)
+
+
+@pytest.mark.parametrize("sizes", [(-1.0, 0.0, 0.0), (0.0, np.nan, 0.0), (0.0, 0.0, np.inf)])
+def test_sizes_that_are_none_are_refused(sizes):
+    with pytest.raises(ValueError, match="noise of"):
+        Noise("q", "rad", *sizes)
 
 
 def test_what_was_not_measured_is_not_noise():

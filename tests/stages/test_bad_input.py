@@ -41,6 +41,7 @@ LOG = "the log of the finished run"
         (errors.ERROR, ["identify", "arm", "--log", LOG], "log of pipeline 'pendulum', not of 'arm'"),
         (errors.ERROR, ["identify", "pendulum", "--log", "none.mcap"], "there is no log"),
         (errors.ERROR, ["identify", "pendulum", "--log", "empty.mcap"], "cut"),
+        (errors.ERROR, ["identify", "pendulum", "--log", "."], "session.mcap"),
         (errors.USAGE, ["identify", "pendulum", "--log", LOG, "--bounds", "gain", "30", "60"], "exclude its nominal"),
         (errors.USAGE, ["identify", "pendulum", "--log", LOG, "--bounds", "gian", "30", "60"], "Available: gain"),
         (errors.USAGE, ["identify", "pendulum", "--log", LOG, "--bounds", "gain", "30"], "expected 3 arguments"),

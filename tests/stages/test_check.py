@@ -87,6 +87,12 @@ def checked(percent=0.5, undetermined=(), recordings=(GOOD,)):
     return Checked("arm", recordings, undetermined, (), rows)
 
 
+def test_an_error_with_jax_is_not_reported_as_a_missing_package(monkeypatch):
+    monkeypatch.setattr(check_stage, "determine", lambda *_: [].a_defect)
+    with pytest.raises(AttributeError, match="a_defect"):
+        check_stage.check("pendulum", LOG)
+
+
 @pytest.mark.parametrize(("percent", "named"), [(3.0, "9 min"), (0.5, "enough")])
 def test_how_long_to_record_follows_from_the_worst_parameter(percent, named):
     assert named in checked(percent).recommendation[-1]

@@ -60,6 +60,13 @@ def test_mjcf_has_what_was_identified(arm, here, capsys):
     assert gain[0] * 0.7 < gain[1] < gain[0] * 0.9 < gain[0] * 1.1 < gain[2] < gain[0] * 1.35
     limit = model.numeric("sim2real/joint/pan/effort_limit").data
     np.testing.assert_allclose(limit / limit[0], gain / gain[0], rtol=1e-3)  # it goes with the gain
+    assert cli.main(["export", str(file), "--to", "json"]) == 0
+    document = json.loads((here / "arm_identified.json").read_text())
+    assert (document["format"], document["about"]["pipeline"]) == (1, "arm")
+    assert document["delays_s"]["round_trip"] == {"estimate": 0.02, "low": 0.019, "high": 0.021}
+    assert document["mujoco"]["joints"]["pan"]["damping"]["estimate"] == 0.3
+    assert {p["name"] for p in document["parameters"]} >= {"gain", "actuator_delay"}
+    assert document["posterior"]["names"] == ["gain"]
 
 
 def test_python_files_are_python(arm, here, monkeypatch):
@@ -111,3 +118,8 @@ def test_what_is_not_there_is_said(here, capsys, arguments, words):
     (here / "network.onnx").write_bytes(b"x")
     assert cli.main(["export", *arguments]) in (errors.USAGE, errors.ERROR)
     assert words in capsys.readouterr().err
+
+
+def test_the_folder_of_a_policy_is_called_after_its_pipeline(here, finished_run_dir):
+    assert cli.main(["export", str(finished_run_dir), "--to", "policy"]) == 0
+    assert (here / "pendulum_policy" / "policy.json").is_file()

@@ -62,6 +62,14 @@ def test_strict_timing_ends_with_its_code_and_a_complete_log(tmp_path, clocks, m
     assert_torque_ends_off(read_truth(folder / "truth.bin"))
 
 
+def test_an_embedded_robot_does_the_same_each_time(tmp_path):
+    first, second = (call(tmp_path / name, "record", "arm", "--duration-s", 2)[2] for name in "ab")
+    assert (first / "truth.bin").read_bytes() == (second / "truth.bin").read_bytes()
+    once, again = (read_log(folder / "session.mcap").steps["sensor"].start for folder in (first, second))
+    assert len(once) == 100
+    np.testing.assert_array_equal(once, again)
+
+
 def test_a_dry_run_sends_nothing_that_moves_and_is_no_recording(tmp_path):
     """What a device without torque writes to its bus is in tests/hardware/test_withheld.py."""
     flags = ["--duration-s", 1, "--amplitude", 2, "--gate.slew-per-s", 5]

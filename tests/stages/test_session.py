@@ -17,10 +17,11 @@ def test_a_nan_stops_the_graph_and_stands_in_the_log(bad):
     recorder = MemoryRecorder()
     watch = session.Watch(recorder)
     watch.start(5, 7)
-    watch.step(step(0), {"th": np.zeros(np.shape(bad)), "count": 3})
+    fine = {"range_m": np.inf, "flag": True, "n": np.int64(3), "image": np.zeros((2, 2), np.uint8)}
+    watch.step(step(0), {"th": np.zeros(np.shape(bad)), "count": 3, **fine})
     watch.message(MessageRecord("agent", "sensor", 0, 0, 1, 2))
     with pytest.raises(SafetyStop, match="node 'sensor' stopped: its output 'th' is NaN in step 1"):
-        watch.step(step(1), {"th": bad, "count": 3})
+        watch.step(step(1), {"th": bad, "count": 3, **fine})
     episode = recorder.episode()
     assert len(episode.steps["sensor"]) == 2
     assert len(episode.messages["agent", "sensor"]) == 1
