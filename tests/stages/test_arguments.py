@@ -71,6 +71,22 @@ def test_what_is_wrong_is_said_before_anything_happens(pendulum, call, said, tmp
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("kind", "wrong"),
+    [
+        *((IdentifyConfig, wrong) for wrong in (
+            {"held_out": 0.9}, {"held_out": 0.0}, {"settle_s": 11.0}, {"horizon_s": 0.1}, {"spacing_s": -1.0},
+            {"free_run_s": -1.0}, {"folds": 1}, {"folds": -1}, {"folds": 0, "terms": "auto"})),
+        *((TrainConfig, wrong) for wrong in ({"timelines": 0}, {"episode_s": 0.1}, {"randomise": 11.0}, {"seed": -1})),
+        *((DeployConfig, wrong) for wrong in ({"episodes": 0}, {"settle_s": 0.0}, {"settle_s": float("nan")})),
+    ],
+)  # fmt: skip
+def test_settings_that_make_no_sense_are_refused(kind, wrong):
+    with pytest.raises(UsageError):
+        kind(**wrong)
+    assert kind(), "the usual ones are not"
+
+
 def test_a_dict_of_what_is_different_is_a_configuration(pendulum):
     given = {"episode_s": 2.0, "ppo": {"num_envs": 64}}
     own = replace(pendulum.defaults.train, episode_s=2.0, ppo=replace(pendulum.defaults.train.ppo, num_envs=64))

@@ -115,9 +115,3 @@ def test_the_flag_says_which_terms_are_there_and_holds_a_value_in_whichever():
     assert {p.name: (p.nominal, p.free) for p in fewer} == {
         "gain": (1.0, True), "cogging": (0.1, True), "swing": (0.3, False), "bias": (0.2, False),
     }  # fmt: skip
-
-
-@pytest.mark.parametrize("options", [{"folds": 1}, {"folds": -1}, {"folds": 0, "terms": "auto"}])
-def test_folds_that_leave_nothing_to_compare_are_refused(options):
-    with pytest.raises(UsageError, match="folds must be 0, or 2 and more"):
-        IdentifyConfig(**options)

@@ -1,6 +1,7 @@
 """What ``record`` plays: signals, and with ``--excitation FILE`` a motion within the robot's limits."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ ARM = load_robot("so101")
 SERVOS = ARM.drive.servos
 LOW, HIGH = np.array(SERVOS.low), np.array(SERVOS.high)
 T_S = np.arange(0.0, 4.0, 1 / 30)
+CHIRP = Path(__file__).parents[2] / "datasets" / "pendulum" / "chirp.mcap"
 
 
 def wave(reach=0.8):
@@ -51,6 +53,19 @@ def test_columns_are_found_by_joint_in_any_order_and_unit(tmp_path, unit):
     taught = tmp_path / "teleoperated.npz"  # goals come before measurements
     np.savez(taught, t_s=T_S, names=np.array(SERVOS.names), position_rad=0.5 * wave(), goal_rad=wave())
     np.testing.assert_allclose(goals(taught), at_the_robots_rate(wave()), atol=1e-6)
+    holes = wave()
+    holes[10:13, 2] = np.nan
+    np.savez(taught, t_s=T_S, names=np.array(SERVOS.names), goal_rad=holes)
+    np.testing.assert_allclose(goals(taught), at_the_robots_rate(wave()), atol=5e-3)
+
+
+def test_a_log_is_played_as_it_was_sent():
+    robot, log = load_robot("pendulum"), read_log(CHIRP)
+    volts = played(replace(robot.defaults.record, excitation=str(CHIRP), duration_s=5.0), robot, announce=False)
+    sent_s = 1e-6 * log.steps["actuator"].end
+    expected = np.interp(np.arange(len(volts)) / 50.0, sent_s - sent_s[0], log.outputs["actuator"]["action"].ravel())
+    assert len(volts) == 250
+    np.testing.assert_allclose(volts.ravel(), expected, atol=1e-6)
 
 
 def test_the_ends_outside_of_the_limits_are_not_played(tmp_path, capsys):
@@ -93,6 +108,10 @@ def test_files_without_a_motion_are_refused(tmp_path):
         goals(tmp_path / "other.csv")
     with pytest.raises(UsageError, match="there is no motion"):
         goals(tmp_path / "none.csv")
+    with pytest.raises(UsageError, match="has no 'goal' of 'actuator'"):
+        goals(CHIRP)
+    with pytest.raises(UsageError, match="does not stand on legs"):
+        goals("standing")
     with pytest.raises(UsageError, match="shorter than 1 s"):
         goals(write(tmp_path / "short.csv", wave()[:20]))
     with pytest.raises(UsageError, match="neither multisine, chirp, steps, hand nor standing, nor a file"):
