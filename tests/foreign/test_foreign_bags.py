@@ -140,8 +140,13 @@ def test_messages_that_mcap_cat_has_written(tmp_path):
 
 
 def test_messages_in_json(tmp_path):
-    (table,) = open_tables(in_json(tmp_path / "x.mcap"))
+    def data(k):
+        nanosec, sec = STAMPS_NS[k] % 10**9, STAMPS_NS[k] // 10**9
+        return json.dumps({"at": {"nanosec": int(nanosec), "sec": int(sec)}, "q_rad": Q[k].tolist()}).encode()
+
+    (table,) = open_tables(in_json(tmp_path / "x.mcap", data=data))
     np.testing.assert_allclose(table.signal("/state.q_rad"), Q)
+    np.testing.assert_array_equal(table.signal("/state.at"), STAMPS_NS)
 
 
 @pytest.mark.parametrize("encoding", ["protobuf", "flatbuffer", "cbor"])

@@ -212,10 +212,10 @@ def _sorted(values: Any, own: list[str], names: list[str]) -> list[Any]:
 def _flatten(value: Any, trail: str, row: dict[str, Any]) -> None:
     """Put the numbers of a message into a row by path; stamps become nanoseconds."""
     fields = value if isinstance(value, dict) else {k: getattr(value, k) for k in getattr(value, "__slots__", ())}
-    if set(fields) in ({"sec", "nanosec"}, {"secs", "nsecs"}):
-        sec, nanosec = fields.values()
-        row[trail] = int(sec) * 1_000_000_000 + int(nanosec)
-        return
+    for sec, nanosec in (("sec", "nanosec"), ("secs", "nsecs")):  # JSON has them in any order
+        if set(fields) == {sec, nanosec}:
+            row[trail] = int(fields[sec]) * 1_000_000_000 + int(fields[nanosec])
+            return
     for key, item in fields.items():
         path = f"{trail}.{key}" if trail else key
         if isinstance(item, bool | int | float | str):
