@@ -166,8 +166,8 @@ def test_messages_that_are_packed_one_by_one_are_named(tmp_path):
 def test_a_folder_is_one_recording_and_one_of_sqlite_is_named(tmp_path):
     folder = tmp_path / "bag"
     folder.mkdir()
-    bags.write(folder / "bag_0.mcap", bags.rows(stop=300))
-    bags.write(folder / "bag_1.mcap", bags.rows(begin=300))
+    for i in range(12):
+        bags.write(folder / f"bag_{i}.mcap", bags.rows(begin=50 * i, stop=50 * (i + 1)))
     (folder / "metadata.yaml").write_text("rosbag2_bagfile_information:\n")
     is_right(imported(folder)[0])
     other = tmp_path / "other"

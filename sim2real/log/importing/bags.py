@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -81,7 +82,8 @@ def read_messages(path: Path, rows: Sequence[Mapping[str, Any]]) -> Table:
 def _files(path: Path) -> list[Path]:
     if path.is_file():
         return [path]
-    files = sorted(path.glob("*.mcap"))
+    parts = lambda file: [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", file.name)]  # noqa: E731
+    files = sorted(path.glob("*.mcap"), key=parts)  # bag_2 comes before bag_10
     for other in sorted(p for p in path.iterdir() if p.is_file()) if not files else ():
         with other.open("rb") as stream:
             refuse_container(other, stream.read(64))
