@@ -146,8 +146,14 @@ def test_arrays(tmp_path):
     table = read(tmp_path / "y.npz", npz(q=np.arange(3.0), o=np.array([{}], object)))
     with pytest.raises(UsageError, match="never loaded"):
         table.signal("o")
-    with pytest.raises(UsageError, match="no column 5"):
-        read(tmp_path / "z.npz", npz(q=np.zeros((3, 2)))).signal("q[:,5]")
+    table = read(tmp_path / "z.npz", npz(q=np.arange(6.0).reshape(3, 2), t=np.zeros(3)))
+    for columns in ("5", "2", "-3", "1:9", "5:9", "-3:", "1:1"):
+        with pytest.raises(UsageError, match=f"no column {columns}"):
+            table.signal(f"q[:,{columns}]")
+    with pytest.raises(UsageError, match="no column 0"):
+        table.signal("t[:,0]")
+    for columns, chosen in (("1", [1, 3, 5]), ("-1", [1, 3, 5]), ("1:2", [[1], [3], [5]]), (":1", [[0], [2], [4]])):
+        np.testing.assert_array_equal(table.signal(f"q[:,{columns}]"), chosen)
 
 
 def test_a_damaged_array_is_refused_when_it_is_used(tmp_path):

@@ -172,13 +172,17 @@ class Table:
                 hint=f"did you mean {close[0]}?" if close else "correct the source in the mapping",
             )
         values = self.columns[name]
-        try:
-            return values if chosen is None else values[:, chosen]
-        except IndexError:
+        if chosen is None or match is None:
+            return values
+        # numpy would leave out columns that are not there.
+        count = values.shape[1] if values.ndim > 1 else 0
+        ends = [chosen.start, chosen.stop] if isinstance(chosen, slice) else [chosen if chosen < 0 else chosen + 1]
+        if any(abs(end) > count for end in ends if end is not None) or not np.arange(count)[chosen].size:
             raise UsageError(
-                f"{name!r} in {self.path} has the shape {values.shape}, which has no column {chosen}",
+                f"{name!r} in {self.path} has the shape {values.shape}, which has no column {match[2]}",
                 hint="columns are counted from 0",
-            ) from None
+            )
+        return values[:, chosen]
 
 
 def open_tables(path: Path, episode: int | None = None) -> list[Table]:
