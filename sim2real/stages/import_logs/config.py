@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated
 
 from sim2real.errors import UsageError
-from sim2real.log.importing.mapping import LENGTHS_AND_ANGLES
 from sim2real.stages.flag import Flag, check_rate
 
 
@@ -54,13 +53,14 @@ class ImportConfig:
             )
         if self.out is not None and len(self.files) > 1 and not self.together:
             raise UsageError(f"out names one log, but there are {len(self.files)} files", hint="import them one by one")
-        if self.unit is not None and not re.fullmatch(
-            f"{'|'.join(LENGTHS_AND_ANGLES)}|counts:[1-9][0-9]*|hundredths", self.unit
-        ):
-            raise UsageError(
-                f"unknown unit {self.unit!r}. Available: {', '.join(LENGTHS_AND_ANGLES)}, counts:N, hundredths",
-                hint="counts:4096 for an encoder with 4096 counts a turn",
-            )
+        if self.unit is not None:
+            from sim2real.log.importing.mapping import LENGTHS_AND_ANGLES  # imported late: --help needs no numpy
+
+            if not re.fullmatch(f"{'|'.join(LENGTHS_AND_ANGLES)}|counts:[1-9][0-9]*|hundredths", self.unit):
+                raise UsageError(
+                    f"unknown unit {self.unit!r}. Available: {', '.join(LENGTHS_AND_ANGLES)}, counts:N, hundredths",
+                    hint="counts:4096 for an encoder with 4096 counts a turn",
+                )
 
     @property
     def selection(self) -> slice | None:
