@@ -46,7 +46,7 @@ def at_the_robots_rate(pose):
 
 
 @pytest.mark.parametrize("unit", ["deg", "rad"])
-def test_columns_are_found_by_joint_in_any_order_and_unit(tmp_path, unit):
+def test_columns_are_found_by_joint_in_any_order_and_unit(tmp_path, unit, capsys):
     path = write(tmp_path / "motion.csv", wave(), order=[3, 0, 5, 1, 2, 4], unit=unit)
     np.testing.assert_allclose(goals(path), at_the_robots_rate(wave()), atol=1e-6)
     assert len(goals(path, duration_s=2.0)) == 100
@@ -57,6 +57,11 @@ def test_columns_are_found_by_joint_in_any_order_and_unit(tmp_path, unit):
     holes[10:13, 2] = np.nan
     np.savez(taught, t_s=T_S, names=np.array(SERVOS.names), goal_rad=holes)
     np.testing.assert_allclose(goals(taught), at_the_robots_rate(wave()), atol=5e-3)
+    assert "warning" not in capsys.readouterr().err
+    holes[31:60, 2] = np.nan
+    np.savez(taught, t_s=T_S, names=np.array(SERVOS.names), goal_rad=holes)
+    assert np.isfinite(goals(taught)).all()
+    assert "warning: the file has no values from 1.0 to 2.0 s" in capsys.readouterr().err
 
 
 def test_a_log_is_played_as_it_was_sent():

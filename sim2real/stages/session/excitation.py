@@ -57,6 +57,10 @@ def played(config: RecordConfig, robot: Robot, announce: bool = False) -> np.nda
         note(f"motion: {source}, {len(rows) / robot.drive.rate_hz:.1f} s")
         if skipped_s > 2.0 / robot.drive.rate_hz:
             note(f"motion: {skipped_s:.1f} s at its ends are outside of the limits, and are not played")
+        gaps_s = np.diff(t_s)
+        k = int(np.argmax(gaps_s))
+        if gaps_s[k] > max(0.3, 5.0 * float(np.median(gaps_s))):
+            note(f"warning: the file has no values from {t_s[k]:.1f} to {t_s[k + 1]:.1f} s: a straight line is played")
     return rows - robot.drive.centre
 
 
