@@ -59,17 +59,14 @@ class Uncertainty:
         standard_error: Shape ``(P,)``.
         low: Shape ``(P,)``: lower end of the 95 % interval, within the bounds.
         high: Shape ``(P,)``: upper end.
-        verdict: State of each parameter, see ``OK``.
-        misfit: Root mean square of the residuals, in standard deviations of the measurement and without the robust
-            loss: 1 if the model explains everything except noise.
+        state: That of each parameter, see ``OK``.
     """
 
     scale_covariance: np.ndarray
     standard_error: np.ndarray
     low: np.ndarray
     high: np.ndarray
-    verdict: tuple[str, ...]
-    misfit: float
+    state: tuple[str, ...]
 
 
 def from_linearised(problem: Problem, at: Linearised) -> Uncertainty:
@@ -93,12 +90,11 @@ def _of_covariance(table: ParameterTable, x: np.ndarray, cov: np.ndarray, at: Li
     margin = np.minimum(x - table.low, table.high - x) / table.span
     reach = float(special.stdtrit(max(float(at.count), 3.0), 0.975))
     low, high = (table.unscale(x + sign * reach * error) for sign in (-1.0, 1.0))
-    verdicts = [
+    states = [
         BOUND if m < AT_BOUND else UNDETERMINED if e > VAGUE else OK
         for m, e in zip(margin, error / table.span, strict=True)
     ]
-    misfit = float(np.sqrt(np.sum(at.raw**2) / max(at.count, 1)))
-    return Uncertainty(cov, error * np.abs(slope), low, high, tuple(verdicts), misfit)
+    return Uncertainty(cov, error * np.abs(slope), low, high, tuple(states))
 
 
 def between_parts(
@@ -129,12 +125,10 @@ def between_parts(
     # No standard error exceeds that of a uniform distribution within the bounds.
     factor = np.minimum(factor, np.maximum(1.0, table.span / np.sqrt(12.0) / np.maximum(errors, 1e-30)))
     wider = _of_covariance(table, at.x, spread.scale_covariance * np.outer(factor, factor), at)
-    kept = [
-        old if old in (ABSENT, NOT_REACHED) else new for old, new in zip(spread.verdict, wider.verdict, strict=True)
-    ]
-    one_sided = np.isin(spread.verdict, (ABSENT, NOT_REACHED))
+    kept = [old if old in (ABSENT, NOT_REACHED) else new for old, new in zip(spread.state, wider.state, strict=True)]
+    one_sided = np.isin(spread.state, (ABSENT, NOT_REACHED))
     low, high = np.where(one_sided, spread.low, wider.low), np.where(one_sided, spread.high, wider.high)
-    return replace(wider, verdict=tuple(kept), low=low, high=high)
+    return replace(wider, state=tuple(kept), low=low, high=high)
 
 
 def _without_blocks(at: Linearised, variance: float) -> tuple[np.ndarray, np.ndarray]:
@@ -157,26 +151,26 @@ def _with_absent(spread: Uncertainty, table: ParameterTable, at: Linearised, var
     Its effect is proportional to its value, so the derivative by the value gives an upper end. A limit that no motion
     reaches has no effect: all larger values are equally good, and the estimate stays nominal.
     """
-    J, verdicts, low, high = (
+    J, states, low, high = (
         at.jacobian.reshape(-1, len(at.x)),
-        list(spread.verdict),
+        list(spread.state),
         spread.low.copy(),
         spread.high.copy(),
     )
     information, values, slope = J.T @ J / variance, table.unscale(at.x), np.abs(table.slope(at.x))
     prior, freely = at.prior, np.diag(at.prior)
     for i, p in enumerate(table.columns):
-        if verdicts[i] == OK or p.narrowed:
+        if states[i] == OK or p.narrowed:
             continue
         if p.limits and information[i, i] * table.span[i] ** 2 < 1.0 / VAGUE**2:
-            verdicts[i], low[i], high[i] = NOT_REACHED, values[i], p.high
+            states[i], low[i], high[i] = NOT_REACHED, values[i], p.high
         elif p.vanishes or p.low == 0.0:
             loose = prior - np.diag(np.where(np.arange(len(at.x)) == i, freely * (1.0 - 1e-6), 0.0))
             root = root_of_inverse(information + loose)
             bound = values[i] + _ONE_SIDED * slope[i] * float(np.sqrt(root[i] @ root[i]))
             if bound <= VAGUE * _ONE_SIDED * p.high:
-                verdicts[i], low[i], high[i] = ABSENT, 0.0, bound
-    return replace(spread, verdict=tuple(verdicts), low=low, high=high)
+                states[i], low[i], high[i] = ABSENT, 0.0, bound
+    return replace(spread, state=tuple(states), low=low, high=high)
 
 
 def loss_variance(problem: Problem, at: Linearised) -> float:

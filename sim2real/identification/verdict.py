@@ -129,7 +129,7 @@ def estimates(
             ends = spread.standard_error[i], spread.low[i], spread.high[i]
             numbers = dict(zip(("standard_error", "low95", "high95"), map(float, ends), strict=True))
             x = p.to_scale(value)
-            state = _state_of(spread.verdict[i], p, bool(table.high[i] - x < x - table.low[i]))
+            state = _state_of(spread.state[i], p, bool(table.high[i] - x < x - table.low[i]))
         own = None if p.kind == "delay" and ROUND_TRIP in truth else truth.get(p.name)
         row = Estimate(p.name, p.unit, p.kind, p.about, p.nominal, value, state, lower=p.low, upper=p.high, truth=own)
         rows.append(replace(row, **numbers))
@@ -193,10 +193,10 @@ def _absent(table: ParameterTable, spread: Uncertainty) -> list[str]:
     messages = []
     for i, name in enumerate(table.names):
         unit = table.columns[i].unit
-        if spread.verdict[i] == ABSENT:
+        if spread.state[i] == ABSENT:
             bound = f"at most {spread.high[i]:.2g} {unit} (95 %)"
             messages.append(f"{name} is small: {bound}, and it may be 0")
-        elif spread.verdict[i] == NOT_REACHED:
+        elif spread.state[i] == NOT_REACHED:
             bound = f"it is at least {spread.low[i]:.2g} {unit} (95 %)"
             above = "no larger value changes the predictions for these recordings"
             messages.append(f"{name} is not reached: {bound}, and {above}")
@@ -247,7 +247,7 @@ def _at_bounds(
     """
     messages, at_zero, flags = [], [], []
     for i in determined:
-        if spread.verdict[i] != BOUND:
+        if spread.state[i] != BOUND:
             continue
         p = table.columns[i]
         upper = bool(table.high[i] - x[i] < x[i] - table.low[i])

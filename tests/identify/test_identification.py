@@ -22,7 +22,7 @@ def test_truth_is_recovered_and_the_interval_of_the_round_trip_covers_it(fitted)
     found, truth, spread = fitted.values, fitted.truth, fitted.spread
     for name in ("gain", "gravity", "damping", "friction"):
         assert found[name] == pytest.approx(truth[name], rel=0.03)
-    assert spread.verdict == ("ok",) * 5
+    assert spread.state == ("ok",) * 5
     error = spread.standard_error[list(fitted.problem.table.names).index("actuator_delay")]
     assert error < 0.002
     assert round_trip(found) == pytest.approx(round_trip(truth), abs=min(0.001, 1.96 * error))

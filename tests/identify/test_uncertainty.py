@@ -51,10 +51,9 @@ def test_a_linear_model_with_white_noise_has_the_textbooks_covariance():
     spread = np.sqrt(np.diag(found.scale_covariance))
     correlation = found.scale_covariance / np.outer(spread, spread)
     np.testing.assert_allclose(correlation, expected / np.outer(errors, errors), atol=0.02)
-    assert found.misfit == pytest.approx(np.sqrt(rss / len(flat)))
     np.testing.assert_allclose(found.high - b, 1.961 * found.standard_error, rtol=1e-3)
     np.testing.assert_allclose(b - found.low, 1.961 * found.standard_error, rtol=1e-3)
-    assert found.verdict == ("ok",) * 3
+    assert found.state == ("ok",) * 3
 
 
 def test_a_residual_that_is_exactly_zero_counts():
@@ -136,7 +135,7 @@ def test_what_nothing_determines_gets_the_width_of_its_bounds():
     r = 0.1 * rng.normal(size=(10, 50, 1))
     at = Linearised(r, X, np.diag(12.0 / table.span**2), np.array([0.2, 0.0]), r)
     found = from_linearised(stub(table), at)
-    assert found.verdict == ("ok", "not determined")
+    assert found.state == ("ok", "not determined")
     np.testing.assert_allclose(np.sqrt(found.scale_covariance[1, 1]), table.span[1] / np.sqrt(12.0), rtol=1e-5)
     assert found.standard_error[1] == pytest.approx(1.0 * table.span[1] / np.sqrt(12.0), rel=1e-5)  # value 1 times dlog
     assert (found.low[1], found.high[1]) == (pytest.approx(0.1, rel=0.2), pytest.approx(10.0, rel=0.2))
@@ -148,14 +147,13 @@ def test_an_estimate_at_a_bound_is_told():
     for x, verdict in ((0.5, "ok"), (0.995, "at a bound"), (-0.995, "at a bound")):
         at = Linearised(noise, np.ones((10, 50, 1, 1)), np.diag(12.0 / table.span**2), np.array([x]), noise)
         found = from_linearised(stub(table), at)
-        assert found.verdict == (verdict,)
+        assert found.state == (verdict,)
         assert -1.0 <= found.low[0] < found.high[0] <= 1.0
     # However a robust loss tames what is far off: 10 deviations are 10.
-    assert from_linearised(stub(table), replace(at, raw=np.full_like(noise, 10.0))).misfit == pytest.approx(10.0)
     # Being vague makes it no less at a bound.
     table = ParameterTable([Parameter("a", "1", 0.0, -0.1, 0.1, "linear")])
     at = Linearised(noise, 0.3 * np.ones((10, 50, 1, 1)), np.diag(12.0 / table.span**2), np.array([0.1]), noise)
-    assert from_linearised(stub(table), at).verdict == ("at a bound",)
+    assert from_linearised(stub(table), at).state == ("at a bound",)
 
 
 def test_an_inverse_of_what_doubles_do_not_resolve_has_no_negative_variances():
@@ -210,19 +208,19 @@ def test_a_friction_that_may_be_0_has_an_upper_bound_and_is_no_open_question():
     value = 0.0015
     at = linear(table, [0.0, np.log(value)], [5.0, 20.0 * value])
     found = from_linearised(stub(table), at)
-    assert found.verdict == ("ok", "absent")
+    assert found.state == ("ok", "absent")
     assert found.low[1] == 0.0
     assert found.high[1] == pytest.approx(value + 1.645 / (20.0 * np.sqrt(600)), rel=0.1)
     # One that could be large is not determined.
     vague = from_linearised(stub(table), linear(table, [0.0, np.log(value)], [5.0, 0.01 * value]))
-    assert vague.verdict[1] == "not determined"
+    assert vague.state[1] == "not determined"
 
 
 def test_a_limit_that_no_motion_reaches_is_told_as_that():
     limit = Parameter("torque", "N m", 2.0, 0.5, 50.0, limits=True, term="torque", off=1e9)
     table = table_of(Parameter("gain", "1", 1.0, 0.1, 10.0), limit)
     found = from_linearised(stub(table), linear(table, [0.0, np.log(3.0)], [5.0, 0.0]))
-    assert found.verdict == ("ok", "not reached")
+    assert found.state == ("ok", "not reached")
     assert (found.low[1], found.high[1]) == (pytest.approx(3.0), pytest.approx(50.0))
 
 

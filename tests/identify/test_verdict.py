@@ -41,7 +41,7 @@ def both(first, second):
 
 def spread(**verdicts):
     own = tuple(verdicts.get(n, "ok") for n in TABLE.names)
-    return SimpleNamespace(verdict=own, high=np.full(len(own), 0.0123))
+    return SimpleNamespace(state=own, high=np.full(len(own), 0.0123))
 
 
 def check(*groups):
@@ -156,7 +156,7 @@ def test_a_delay_whose_bounds_were_narrowed_gets_wider_ones():
     x, own = (narrow.low + narrow.high) / 2, narrow.names.index("sensor_delay")
     x[own] = narrow.high[own]
     verdicts = ["ok"] * own + ["at a bound"]
-    made = SimpleNamespace(verdict=tuple(verdicts))
+    made = SimpleNamespace(state=tuple(verdicts))
     found = verdict.judge(rows(0.1, 1.0), narrow, x, made, check(), max_delay_s=0.06)
     assert found.next == "--bounds sensor_delay 0 0.02"
     # The model's own longest delay is a flag, up to a second.
@@ -221,7 +221,7 @@ def test_the_rows_have_a_state_and_the_sum_of_the_delays():
     table = TABLE.with_fixed({"actuator_delay": 0.01})
     x, count = (table.low + table.high) / 2, len(table)
     verdicts = ("ok", "not determined", "absent", "ok")
-    made = Uncertainty(np.eye(count), np.ones(count), table.low, table.high, verdicts, 1.0)
+    made = Uncertainty(np.eye(count), np.ones(count), table.low, table.high, verdicts)
     values = as_numbers(table, x)
     found = {row.name: row for row in estimates(table, values, made, {"gain": 2.1, "round_trip_delay": 0.05})}
     assert [found[n].state for n in table.names] == ["ok", "not determined", "ok", "ok"]

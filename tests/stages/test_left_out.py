@@ -40,8 +40,7 @@ def known():
         standard_error=error,
         low=np.array([0.98]),
         high=np.array([1.02]),
-        verdict=("ok",),
-        misfit=1.0,
+        state=("ok",),
     )
     return SimpleNamespace(table=table, spread=spread, at=at_point([1.0]))
 
@@ -55,7 +54,7 @@ def test_estimates_that_differ_between_parts_widen_the_interval_to_the_jackknife
     assert found.high[0] - 1.0 == pytest.approx(1.96 * reach, rel=0.01)
     assert found.scale_covariance[0, 0] == pytest.approx(reach**2, rel=0.02)
     far = widened(known.spread, known.table, known.at, [left(str(k), 1.0 + k) for k in range(5)])
-    assert far.verdict == ("not determined",)
+    assert far.state == ("not determined",)
     assert far.low[0] >= 0.0
 
 
@@ -78,7 +77,7 @@ def test_what_one_part_alone_determines_widens_as_the_others():
     table = ParameterTable([Parameter(n, "1", 1.0, 0.0, 100.0, "linear") for n in ("gain", "touch")])
     two, error = np.ones(2), 0.01 * np.ones(2)
     square = np.diag(error**2)
-    spread = Uncertainty(square, error, 0.98 * two, 1.02 * two, ("ok",) * 2, 1.0)
+    spread = Uncertainty(square, error, 0.98 * two, 1.02 * two, ("ok",) * 2)
     values, shares = np.array([0.9, 1.0, 1.1, 1.05, 0.95]), [0.0, 0.9, 0.1, 0.0, 0.0]
     rows = [
         HeldOutPart(str(k), {"gain": v, "touch": 1.0 + 5.0 * s}, {"gain": 0.2, "touch": s}, {"th": 0.1})
