@@ -50,14 +50,18 @@ class Groups:
                 np.logical_or(free[1], belongs, out=free[1])
         return [members for members, _ in groups]
 
-    def spread(self, changes: np.ndarray, groups: Sequence[Sequence[int]], size: int) -> np.ndarray:
-        """Return derivatives ``(..., F, size)`` from changes along groups ``(G, ..., F)``."""
-        J = np.zeros((*changes.shape[1:], size))
+    def spread(self, changes: np.ndarray, groups: Sequence[Sequence[int]], width: np.ndarray) -> np.ndarray:
+        """Return derivatives ``(size, ..., F)`` from changes along groups ``(G, ..., F)``.
+
+        Args:
+            width: Shape ``(size,)``: by how much each column was moved.
+        """
+        J = np.zeros((len(width), *changes.shape[1:]))
         for change, members in zip(changes, groups, strict=True):
             for c in members:
-                J[..., c] = change if len(members) == 1 else np.where(self._belongs[c], change, 0.0)
+                np.divide(change if len(members) == 1 else np.where(self._belongs[c], change, 0.0), width[c], out=J[c])
         if self._apart and not self._belongs.size:
-            self._belongs = self._found(np.abs(J).max(axis=tuple(range(J.ndim - 2))).T)
+            self._belongs = self._found(np.abs(J).max(axis=tuple(range(1, J.ndim - 1))))
         return J
 
     def _found(self, slope: np.ndarray) -> np.ndarray:
@@ -84,11 +88,11 @@ def trees_are_apart(model: MjModel | None) -> bool:
 class Nearby:
     """Residuals near a point, and their Jacobian, which is corrected after each step, and computed again if that fails.
 
-    The correction is Broyden's rank-one update (Math. Comp. 19, 1965).
+    The correction is Broyden's rank-one update (Math. Comp. 19, 1965), in place: an arm's Jacobian has 100 MB.
 
     Args:
         value: Residuals ``(N,)`` at a point ``(P,)``.
-        slope: Their Jacobian ``(N, P)``.
+        slope: Their Jacobian ``(P, N)``, a row for each parameter.
         scale: Shape ``(P,)``: typical step of each parameter, so that steps of different units compare.
         known: Point, residuals and Jacobian of an earlier evaluation nearby, from which the first Jacobian is made.
         most: Most Jacobians that are computed; later ones are only corrected. Default: as many as needed.
@@ -113,7 +117,7 @@ class Nearby:
         return self._last[1]
 
     def jacobian(self, y: np.ndarray) -> np.ndarray:
-        """Return the Jacobian at the point of the last step."""
+        """Return the Jacobian ``(P, N)`` at the point of the last step."""
         if self._known is not None and np.array_equal(self._known[0], y):
             return self._known[2]
         r, J = self.residuals(y), None
@@ -145,9 +149,9 @@ def _updated(
     scale: np.ndarray | float,
     trusted: float,
 ) -> np.ndarray | None:
-    """Return the Jacobian corrected by a step; None if the old one predicted the step badly."""
+    """Correct a Jacobian ``(P, N)`` by a step and return it; None if the old one predicted the step badly."""
     step = y - point
-    expected = J @ step
+    expected = step @ J
     missed = r - before - expected
     direction = step / scale**2
     length = float(step @ direction)
@@ -155,4 +159,6 @@ def _updated(
         return J
     if not np.linalg.norm(missed) <= trusted * np.linalg.norm(expected):
         return None
-    return J + np.outer(missed, direction / length)
+    for row, share in zip(J, direction / length, strict=True):
+        row += share * missed
+    return J

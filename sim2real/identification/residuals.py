@@ -242,12 +242,12 @@ class Problem:
         low, high = (self._moved(x, groups, sign) for sign in (-1.0, 1.0))
         both = self._raw(np.concatenate([high, low]), states, part)
         width = np.clip(x + self._step, None, self.table.high) - np.clip(x - self._step, self.table.low, None)
-        J = self._groups.spread(both[: len(groups)] - both[len(groups) :], groups, len(x)) / width
+        J = self._groups.spread(both[: len(groups)] - both[len(groups) :], groups, width)
         r, slope = robust(raw, self.config.reach)
         prior, of_prior = self._prior(x), self._prior_slope(x)
         precision = of_prior.T @ of_prior + np.diag(12.0 / self.table.span**2)
         loss = self._loss(r, prior, part)
-        there = Linearised(r, slope[..., None] * J, precision, x, raw, self.compared(part), loss)
+        there = Linearised(r, np.moveaxis(slope * J, 0, -1), precision, x, raw, self.compared(part), loss)
         self._last = [*self._last, (x.copy(), part, there, J)][-_CACHED:]
         return there
 
@@ -280,8 +280,8 @@ class Problem:
             groups = self._step_groups.members(np.flatnonzero(part.present).tolist())
             moved = self._moved(y, groups, sign)
             raw = self._raw(np.concatenate([y[None], moved]), states, part)
-            J = self._step_groups.spread(raw[1:] - raw[0], groups, len(y)) / (sign * self._step)
-            return np.concatenate([J.reshape(-1, len(y)), self._prior_slope(y)])
+            raw[1:] -= raw[0]
+            return self._with_prior_slope(self._step_groups.spread(raw[1:], groups, sign * self._step), y)
 
         return Nearby(value, slope, self.table.span, self._known_nearby(x, part), slopes)
 
@@ -375,9 +375,14 @@ class Problem:
         span = self.table.span
         point, there, J = min(found, key=lambda row: float(np.linalg.norm(((row[0] - x) / span)[part.present])))
         r = np.where(part.live[:, None, None], there.raw, 0.0).reshape(-1)
-        J = np.where(part.live[:, None, None, None] & part.present, J, 0.0).reshape(-1, len(x))
+        rows = np.where(part.live[:, None, None] & part.present[:, None, None, None], J, 0.0)
         start = np.where(part.present, point, x)
-        return start, np.concatenate([r, self._prior(start)]), np.concatenate([J, self._prior_slope(start)])
+        return start, np.concatenate([r, self._prior(start)]), self._with_prior_slope(rows, start)
+
+    def _with_prior_slope(self, rows: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Return the Jacobian ``(P, N)`` of residuals and priors from that of the residuals ``(P, S, K, F)``."""
+        rows, of_prior = rows.reshape(len(x), -1), self._prior_slope(x).T
+        return np.concatenate([rows, of_prior], axis=1) if of_prior.size else rows
 
     def _prior(self, x: np.ndarray) -> np.ndarray:
         return self.table.prior_residuals(x)
@@ -480,8 +485,11 @@ class Problem:
         shifts = (shift[:, None] + moves).reshape(-1, self._n)
         errors = self.errors(spread, np.repeat(segments, len(moves)), shifts)
         errors = np.moveaxis(errors.reshape(len(segments), len(moves), *errors.shape[1:]), 1, 0)
-        changes = (errors[1 : len(groups) + 1] - errors[len(groups) + 1 :]) / (2.0 * _STATE_DIFFERENCE)
-        return np.moveaxis(self._state_groups.spread(changes, groups, self._n), -1, 1), errors[0]
+        changes, width = (
+            errors[1 : len(groups) + 1] - errors[len(groups) + 1 :],
+            np.full(self._n, 2 * _STATE_DIFFERENCE),
+        )
+        return np.moveaxis(self._state_groups.spread(changes, groups, width), 0, 1), errors[0]
 
     def with_readings(self, readings: Mapping[str, np.ndarray]) -> Problem:
         """Return the problem with other measurements: field -> ``(E, K, ...)``; both share programs."""

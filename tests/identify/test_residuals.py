@@ -159,9 +159,9 @@ def test_the_robust_loss_is_scipys(reach, loss):
 
 def test_a_jacobian_is_corrected_until_it_no_longer_predicts_the_step():
     A, computed = np.random.default_rng(0).normal(size=(6, 2)), []
-    there = Nearby(lambda y: A @ y, lambda y: computed.append(1) or A.copy())
+    there = Nearby(lambda y: A @ y, lambda y: computed.append(1) or A.T.copy())
     for y in ([0.0, 0.0], [1.0, 0.5], [2.0, -1.0]):
-        np.testing.assert_allclose(there.jacobian(np.array(y)), A)
+        np.testing.assert_allclose(there.jacobian(np.array(y)), A.T)
     assert len(computed) == 1
     # A step that failed may ask for a computed one, once.
     assert (there.renew(np.array(y)), there.renew(np.array(y)), len(computed)) == (True, False, 2)
@@ -177,20 +177,20 @@ def test_a_jacobian_is_corrected_until_it_no_longer_predicts_the_step():
 
 def test_columns_of_separate_trees_are_moved_together():
     """Two legs of two joints each, of which the second moves with the first, and a delay of all."""
-    J = np.zeros((3, 4, 5))
-    J[..., :2, 0] = J[..., 2:, 2] = 1.0
-    J[..., 1, 1] = J[..., 3, 3] = J[..., :, 4] = 2.0
+    J, width = np.zeros((5, 3, 4)), np.full(5, 2.0)
+    J[0, :, :2] = J[2, :, 2:] = 1.0
+    J[1, :, 1] = J[3, :, 3] = J[4] = 2.0
     groups = Groups(apart=True)
     assert groups.members(range(5)) == [[0], [1], [2], [3], [4]]
-    np.testing.assert_array_equal(groups.spread(np.moveaxis(J, -1, 0), groups.members(range(5)), 5), J)
+    np.testing.assert_array_equal(groups.spread(2.0 * J, groups.members(range(5)), width), J)
     together = groups.members(range(5))
     assert sorted(map(sorted, together)) == [[0, 2], [1, 3], [4]]
-    changes = np.stack([J[..., g].sum(axis=-1) for g in together])
-    np.testing.assert_array_equal(groups.spread(changes, together, 5), J)
+    changes = np.stack([2.0 * J[g].sum(axis=0) for g in together])
+    np.testing.assert_array_equal(groups.spread(changes, together, width), J)
     assert Groups(apart=False).members(range(2)) == [[0], [1]]
     # Initial states belong to their whole tree: at another point more of it may respond.
     states = Groups(apart=True, by_tree=True)
-    states.spread(np.moveaxis(J[..., :4], -1, 0), [[0], [1], [2], [3]], 4)
+    states.spread(J[:4], [[0], [1], [2], [3]], width[:4])
     assert states.members(range(4)) == [[0, 2], [1, 3]]
 
 

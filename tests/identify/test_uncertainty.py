@@ -1,6 +1,5 @@
 """Uncertainty: textbook covariances where they hold, and honest ones where they do not."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -149,7 +148,6 @@ def test_an_estimate_at_a_bound_is_told():
         found = from_linearised(stub(table), at)
         assert found.state == (verdict,)
         assert -1.0 <= found.low[0] < found.high[0] <= 1.0
-    # However a robust loss tames what is far off: 10 deviations are 10.
     # Being vague makes it no less at a bound.
     table = ParameterTable([Parameter("a", "1", 0.0, -0.1, 0.1, "linear")])
     at = Linearised(noise, 0.3 * np.ones((10, 50, 1, 1)), np.diag(12.0 / table.span**2), np.array([0.1]), noise)
