@@ -48,10 +48,9 @@ def robot_environment(
     from sim2real.interop.robot import RobotEnvironment
     from sim2real.robots.robot import Robot
     from sim2real.stages.load import available, defaults_of, load_robot, moving
-    from sim2real.stages.shared.find_run import find_run
+    from sim2real.stages.shared.find_run import find_parameters, find_run
     from sim2real.stages.train.bundle import contract_of
     from sim2real.stages.train.setup import prepare
-    from sim2real.stages.train.stage import find_parameters
 
     run = None
     if isinstance(source, Robot):
@@ -63,8 +62,9 @@ def robot_environment(
         name = next(a.manifest.pipeline for s in STAGES for a in attempts(run, s))
         robot = moving(load_robot(name))
     config = replace(config or defaults_of(robot).train, model=model)
-    path, _ = find_parameters(robot, config, Path(runs), run)
-    identification = None if path is None else Identification.load(path)
+    identification = None
+    if model != "nominal":
+        identification = Identification.load(find_parameters(config.parameters or robot.name, Path(runs), run))
     setup = prepare(robot, config, identification, changed=values)
     return RobotEnvironment(setup.env, contract_of(setup.robot, setup.env.task, setup.values))
 

@@ -428,7 +428,8 @@ def in_world(robot: AnyRobot, name: str | None) -> AnyRobot:
 
 def channels_of(robot: RecordedRobot) -> tuple[Channel, ...]:
     """Return the measured quantities of each joint: those of the drive, or of the logs."""
-    return getattr(robot, "drive", robot).channels
+    owner: Any = robot.drive if isinstance(robot, Robot) else robot
+    return owner.channels
 
 
 GRAVITY = "gravity in the base's axes"

@@ -157,7 +157,8 @@ def open_recording(path: Path, robot: RecordedRobot) -> Recording:
         channels, read = channels_of(robot), recording.episode.outputs.get(SENSOR, {})
         joints = [c.label for c in channels]
         for field in {c.position for c in channels if c.index is not None} & set(read):
-            entries, width = {c.index for c in channels if c.position == field}, read[field].shape[-1]
+            entries = {c.index for c in channels if c.position == field and c.index is not None}
+            width = read[field].shape[-1]
             # A robot of one joint may take an entry of a longer vector.
             if max(entries) >= width or (len(entries) > 1 and len(entries) != width):
                 raise UsageError(

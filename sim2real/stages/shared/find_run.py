@@ -48,14 +48,20 @@ def find_run(root: Path, target: str | Path, pipeline: str | None = None) -> Pat
     raise _nothing_there(root, str(target))
 
 
-def find_parameters(source: str, runs: Path) -> Path:
-    """Return the file of the identification that a text names: a file, a stage folder, a pipeline or a run."""
+def find_parameters(source: str, runs: Path, run_dir: Path | None = None) -> Path:
+    """Return the file of the identification that a text names: a file, a stage folder, a pipeline or a run.
+
+    Args:
+        run_dir: Run in which a pipeline's identification is looked for; None: any.
+    """
     from sim2real.artifacts.identification import PARAMETERS
 
     path = Path(source)
     if path.is_file():
         return path
-    return path / PARAMETERS if (path / PARAMETERS).is_file() else _output(source, runs, "identify", "parameters")
+    if (path / PARAMETERS).is_file():
+        return path / PARAMETERS
+    return _output(source, runs, "identify", "parameters", run_dir)
 
 
 def find_bundle(source: str, runs: Path, run_dir: Path | None = None) -> Path:
@@ -86,7 +92,7 @@ def find_bundle(source: str, runs: Path, run_dir: Path | None = None) -> Path:
         raise
 
 
-def _output(source: str, runs: Path, stage: str, name: str, run_dir: Path | None = None) -> Path:
+def _output(source: str, runs: Path, stage: str, name: str, run_dir: Path | None) -> Path:
     """Return an output of a stage: the newest of a pipeline, or of a run."""
     known = source in available()
     run_dir = run_dir if known else find_run(runs, source)

@@ -28,8 +28,8 @@ class TrainConfig:
     """The learning algorithm."""
     model: Literal["identified", "nominal"] = "identified"
     """Parameters to train on: the estimates of identify, or the nominal ones without any delay."""
-    parameters: Annotated[str | None, Flag("FILE")] = None
-    """parameters.json to train on; default: the newest identification of the pipeline."""
+    parameters: Annotated[str | None, Flag("RUN|PIPELINE|PARAMETERS")] = None
+    """Identification to train on: parameters.json, its folder, or a run; default: the newest of the pipeline."""
     force: bool = False
     """Train on an identification whose verdict is not 'accepted'."""
     explain: bool = False

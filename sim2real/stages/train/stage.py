@@ -14,7 +14,7 @@ from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.paths import shown
 from sim2real.artifacts.recording import Recording
-from sim2real.artifacts.run import RUNNING, StageFolder, attempts, newest, open_stage, run_folders, sha256
+from sim2real.artifacts.run import RUNNING, StageFolder, attempts, open_stage, run_folders, sha256
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.robots.robot import RecordedRobot
 from sim2real.stages.load import AnyRobot, defaults_of, moving, robot_of
@@ -28,7 +28,7 @@ from sim2real.stages.shared.arguments import (
     identification_of,
     recordings_of,
 )
-from sim2real.stages.shared.find_run import find_run, warn_of_stale
+from sim2real.stages.shared.find_run import find_parameters, find_run
 from sim2real.stages.terminal.console import artifact_table, note, progress
 from sim2real.stages.terminal.interruption import patiently
 from sim2real.stages.train.bundle import Watch, bundle_of_training, contract_of, disturbance_rows
@@ -142,7 +142,10 @@ def run(robot: RecordedRobot, config: TrainConfig, root: Path, run_dir: Path | N
     moving(robot)
     interrupted = find_interrupted(robot.name, config, root)
     run_dir = run_dir if interrupted is None else interrupted.run_dir
-    path, run_dir = find_parameters(robot, config, root, run_dir)
+    path = None
+    if config.model != "nominal":
+        path = find_parameters(config.parameters or robot.name, root, run_dir)
+        run_dir = run_dir if config.parameters else run_dir or path.parent.parent
     resume = None
     if interrupted is not None:
         resume = interrupted.folder / CHECKPOINT
@@ -209,22 +212,6 @@ def _explain(
 
 
 # -- inputs
-
-
-def find_parameters(
-    robot: RecordedRobot, config: TrainConfig, root: Path, run_dir: Path | None
-) -> tuple[Path | None, Path | None]:
-    """Return the identification to train on, None for the nominal model, and the run folder to write into.
-
-    Args:
-        run_dir: Run folder; None: the newest one with an identification.
-    """
-    if config.model == "nominal":
-        return None, run_dir
-    if config.parameters is not None:
-        return Path(config.parameters), run_dir
-    identified = warn_of_stale(newest(root, robot.name, "identify", run_dir))
-    return identified.output("parameters"), run_dir or identified.run_dir
 
 
 def _recording(identification: Identification | None, run_dir: Path) -> Recording | None:
