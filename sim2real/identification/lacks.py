@@ -16,11 +16,10 @@ from sim2real.identification.fit import ROUGH, as_numbers, refine
 from sim2real.identification.predictions import Position
 from sim2real.identification.residuals import Linearised, Problem
 from sim2real.identification.terms import ALIKE, MENDS
+from sim2real.identification.uncertainty import FLOOR
 
 _FAR = 3.0
 """A term is missing if the residuals are above this many times the noise."""
-_FLOOR = 0.1
-"""Smallest noise, in assumed standard deviations of a measurement: simulated logs have only errors of integrators."""
 _ALONE = 1.5
 """A log has a fault in its worst second if the error there is this many times the joint's error in the whole log."""
 _PROMISING = 0.95
@@ -193,7 +192,7 @@ def largest_residual(
             continue
         off = document.samples[f"{p.column}_measured"] - document.samples[f"{p.column}_identified"]
         off = off[np.isfinite(off) & (document.samples["into"] > document.internal.settle_s)]
-        level = max(float(np.hypot(of.deviation, of.resolution / np.sqrt(12.0))), _FLOOR * p.sigma)
+        level = max(float(np.hypot(of.deviation, of.resolution / np.sqrt(12.0))), FLOOR * p.sigma)
         if off.size:
             rows.append((p, float(np.sqrt(np.mean(off**2))) / level, level))
     return max(rows, key=lambda row: row[1], default=None)

@@ -44,7 +44,7 @@ _ORDER, _GAIN = 3, 20.0
 """Differences of this order remove slow changes, such as the errors of a model; and their variance for white noise of
 variance 1: 1 + 9 + 9 + 1.
 """
-_FLOOR = 0.1
+FLOOR = 0.1
 """Smallest noise, in assumed standard deviations of a measurement: simulated logs have only errors of integrators."""
 _MULTIPLES = 0.98
 """Readings have a resolution if this share of their differences are multiples of it."""
@@ -382,7 +382,7 @@ def above_noise(at: Linearised) -> float:
     total, white, count = _squares(at)
     if not count.any():
         return np.inf
-    return float(np.sqrt(np.max(total / np.maximum(white, _FLOOR**2 * np.maximum(count, 1)))))
+    return float(np.sqrt(np.max(total / np.maximum(white, FLOOR**2 * np.maximum(count, 1)))))
 
 
 def _squares(at: Linearised) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -51,12 +51,12 @@ def rows(values, count):
 def test_errors_are_those_of_the_solution_by_hand_for_any_number_of_copies(model):
     problem = Problem(model(), [lag_log(0)], SPANS, LENGTH_S, CONFIG)
     rng = np.random.default_rng(0)
-    segment, shift = rng.integers(0, 9, 70), rng.normal(size=(70, 2))
-    gain = rng.uniform(1.0, 2.0, 70)
-    values = rows(OFF, 70) | {"gain": gain}
+    segment, shift = rng.integers(0, 9, 300), rng.normal(size=(300, 2))
+    gain = rng.uniform(1.0, 2.0, 300)
+    values = rows(OFF, 300) | {"gain": gain}
     found = problem.errors(values, segment, shift)
     starts = problem.rollouts.starts(values, segment, shift, problem.data)[:, 0]
-    for i in (0, 31, 69):
+    for i in (0, 31, 299):
         expected = by_hand(problem, segment[i], OFF | {"gain": gain[i]}, starts[i])
         np.testing.assert_allclose(found[i, :, 0], expected, atol=2e-3 * np.abs(expected).max())
     alone = problem.errors({n: v[31:32] for n, v in values.items()}, segment[31:32], shift[31:32])

@@ -30,8 +30,6 @@ _LEAST_SEGMENTS = 4
 """Fewest segments from which parts are held out."""
 _LEAST_TO_CHOOSE = 3
 """Fewest parts for a selection of terms: one is held out, and the others predict each other."""
-_LEAST_PARTS = 4
-"""Fewest parts from which the spread of estimates is computed."""
 _FAR = 2.0
 """Ratio of residuals to noise above which a term may be missing."""
 
@@ -219,8 +217,6 @@ def parts_of(estimate: Fit, config: IdentifyConfig, names: Sequence[str], least:
 
 def widened(spread: Uncertainty, table: ParameterTable, at: Linearised, rows: Sequence[HeldOutPart]) -> Uncertainty:
     """Return an uncertainty that includes the spread of the estimates without one part."""
-    if len(rows) < _LEAST_PARTS:
-        return spread
     values = [[row.values[c.name] for c in table.columns] for row in rows]
     moved = np.array([[c.to_scale(v) for c, v in zip(table.columns, estimates, strict=True)] for estimates in values])
     share = np.array([[row.share.get(name, 0.0) for name in table.names] for row in rows])
