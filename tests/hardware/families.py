@@ -40,10 +40,10 @@ class Family:
     moving: np.ndarray
     gate: Mapping[str, Any]
 
-    def robot(self, plant: str = "", settings: Mapping[str, Any] | None = None, **plant_args: Any) -> VirtualRobot:
+    def robot(self, plant="", settings=None, truth_path=None, **plant_args: Any) -> Any:
         """Return an emulated robot, on which the torque is off."""
-        config = self.emulation(**(settings or {}))
-        return VirtualRobot(getattr(plants, plant or self.plant)(**{"ids": list(IDS), **plant_args}), config)
+        body = getattr(plants, plant or self.plant)(**{"ids": list(IDS), **plant_args})
+        return VirtualRobot(body, self.emulation(**(settings or {})), truth_path)
 
     def device(self, robot: VirtualRobot, **limits: Any) -> Device:
         return self.make(robot.port, **limits)
@@ -55,10 +55,6 @@ class Family:
         """Return the servos whose torque is on now."""
         return [i for i, servo in robot.bus.servos.items() if servo.get(self.torque)]
 
-    def strike(self, robot: VirtualRobot, **faults: Any) -> None:
-        """Let faults begin now."""
-        robot.strike(**faults)
-
     def is_safe(self, effects: np.ndarray) -> np.ndarray:
         """Return for each change of a motor whether it is off, or has no voltage."""
         mode, goal = effects["values"][:, :2].T
@@ -68,8 +64,8 @@ class Family:
 class _Board(Family):
     """An ODrive, which has no guardian: its own watchdog takes the torque off."""
 
-    def robot(self, plant: str = "", settings: Mapping[str, Any] | None = None, **plant_args: Any) -> VirtualRobot:
-        return VirtualRobot(Turntable(**plant_args), self.emulation(**(settings or {})))
+    def robot(self, plant="", settings=None, truth_path=None, **plant_args: Any) -> Any:
+        return VirtualRobot(Turntable(**plant_args), self.emulation(**(settings or {})), truth_path)
 
     def on(self, robot: VirtualRobot) -> list[int]:
         return [0] if robot.bus.axis.properties[odrive.STATE] == odrive.CLOSED_LOOP else []
@@ -82,10 +78,10 @@ class _Board(Family):
 class _Legs(Family):
     """Legs of a Go2 over DDS, which damp before their torque goes off."""
 
-    def robot(self, plant: str = "", settings: Mapping[str, Any] | None = None, **plant_args: Any) -> Any:
+    def robot(self, plant="stand", settings=None, truth_path=None, **plant_args: Any) -> Any:
         from sim2real.emulation.legs import VirtualLegs
 
-        return VirtualLegs(Go2Body("stand"), self.emulation(**(settings or {})))
+        return VirtualLegs(Go2Body(plant), self.emulation(**(settings or {})), truth_path)
 
     def on(self, robot: Any) -> list[int]:
         return np.flatnonzero(robot.legs._modes).tolist()

@@ -26,7 +26,7 @@ def impatient_guardian(monkeypatch):
 
 
 def strike(**faults):
-    return lambda family, robot, rig: family.strike(robot, **faults)
+    return lambda family, robot, rig: robot.strike(**faults)
 
 
 def reboot(family, robot, rig):
