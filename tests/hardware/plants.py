@@ -130,11 +130,3 @@ class Ramp:
 
     def truth(self):
         return {}
-
-
-class Sinking(Joints):
-    """Joints that sink at 0.6 rad/s without torque, from 0.9 s on, to -1.4 rad."""
-
-    def _speed(self, i):
-        speed = super()._speed(i)
-        return -0.6 if self._command[i][0] != POSITION and self._steps * STEP_S > 0.9 and self._q[i] > -1.4 else speed

@@ -1,4 +1,4 @@
-"""A joint that does not do what its commands say stops the robot and is named; a sound one never does."""
+"""A joint that does not do what its commands say stops the robot; tests/robots/test_following.py has whole robots."""
 
 import math
 
@@ -14,9 +14,7 @@ from sim2real.hardware.safety.following import FollowingCheck
 
 GATE = {"limit": 1.5, "slew_per_s": 20.0}
 START = np.array([0.5, -0.8, 0.3])
-FAULT_S = 1.0
-RATES = {ANGLES.name: 0.025, STS.name: 1.25}  # 1 / 50 ms at the gains of both
-LETS_GO = {"lets_go_after_s": FAULT_S, "lets_go": 2}
+LETS_GO = {"lets_go_after_s": 1.0, "lets_go": 2}
 
 
 def swing(t_s):
@@ -35,22 +33,6 @@ def drive(rig, goals, seconds):
         rig.command(goals(t_s), 0.0, 1e-9 * rig.clock.now_ns())
         rig.clock.sleep(0.02)
     return None
-
-
-@pytest.mark.parametrize("family", [ANGLES, STS], ids=lambda family: family.name)
-@pytest.mark.parametrize(
-    ("plant", "fault", "within_s"),
-    [("Sinking", LETS_GO, 0.65), ("Joints", LETS_GO, 0.65), ("Joints", {"frozen_after_s": FAULT_S}, 0.65)],
-    ids=["sinks", "stays", "encoder freezes"],
-)
-def test_a_motor_that_lets_go_stops_the_robot_and_is_named(family, plant, fault, within_s):
-    robot = family.robot(plant, fault, rate_per_gain=RATES[family.name])
-    with family.rig(robot, {**GATE, "joints": ("pan", "lift", "tip"), "following_rad": 0.1}) as rig:
-        stopped_s, message = drive(rig, swing, 3.0)
-    assert FAULT_S < stopped_s < FAULT_S + within_s
-    assert "lift" in message or "frozen_after_s" in fault
-    assert "rad" in message
-    robot.stop()
 
 
 def test_a_joint_at_rest_may_be_moved_off_its_goal_by_less_than_nearly_all_of_the_torque():
@@ -123,28 +105,23 @@ def test_a_command_that_is_held_up_on_its_way_is_not_obeyed_yet():
         let_go(check, np.zeros(1), 1.2, 1.5)
 
 
-FIRST = np.array([-0.8, 0.5, -1.0])
+FIRST = START + np.array([0.0, 1.3, -1.2])
 
 
 @pytest.mark.parametrize("family", [ANGLES, STS], ids=lambda family: family.name)
-def test_a_first_command_far_from_the_measured_pose_is_refused(family):
+def test_each_sender_begins_near_the_measured_pose(family):
     robot = family.robot("Joints")
     with family.rig(robot, {**GATE, "joints": ("pan", "lift", "tip")}) as rig:
         rig.start()
         rig.measure()
-        with pytest.raises(SafetyStop, match=r"'(pan|lift|tip)'.* -?[\d.]+ rad, measured are -?[\d.]+ rad"):
+        with pytest.raises(SafetyStop, match=r"'lift' at 0.5 rad, measured are -0.8"):
             rig.command(FIRST, 0.0, 0.0)
     with family.rig(robot, {**GATE, "first_step_rad": math.inf}) as rig:
         rig.start()
         rig.command(FIRST, 0.0, 0.0)
     robot.stop()
-    modes = robot.truth().of(2)["values"]  # nothing but the goals at rest took effect before the refusal
-    assert modes.size
-
-
-def test_each_sender_begins_near_the_measured_pose():
-    robot = ANGLES.robot("Joints")
-    with ANGLES.rig(robot, GATE) as rig:
+    robot = family.robot("Joints")
+    with family.rig(robot, GATE) as rig:
         rig.start()
         rig.command(START + 0.4, 0.0, 0.0)
         rig.command(START - 0.4, 0.0, 0.02)  # the second command is the gate's to limit

@@ -221,15 +221,12 @@ class Plain(IdleDevice):
     motors, commanded, silence_s, counters = ("wheel",), VOLTAGE, 0.0, Counters()
 
     def __init__(self):
-        self.log, self.hold = [], None
+        self.log = []
 
     def disable(self):
         self.log.append("off")
 
     def command(self, values):
-        if self.hold is not None:
-            self.hold[0].set()
-            assert self.hold[1].wait(10.0)
         self.log.append(values.tolist())
         return Transaction(self.clock.now_ns(), 0, 0, 0)
 
@@ -262,23 +259,4 @@ def test_the_rig_sends_nothing_after_off_to_a_device_that_would_obey():
     begun = list(device.log)
     rig._watch(watchdog)
     assert device.log == begun
-    rig.close()
-
-
-def test_off_waits_for_a_command_that_is_on_its_way():
-    device = Plain()
-    rig = Rig(device, GateConfig(5.0))
-    rig.start()
-    rig._lock, device.hold = NotingLock(), (threading.Event(), threading.Event())
-    watchdog = threading.Thread(target=lambda: rig._watch(rig._done))
-    watchdog.start()
-    assert device.hold[0].wait(10.0)
-    leaving = threading.Thread(target=rig.stop)
-    leaving.start()
-    assert rig._lock.waited_for.wait(10.0)
-    assert "off" not in device.log
-    device.hold[1].set()
-    watchdog.join(10.0)
-    leaving.join(10.0)
-    assert device.log[-1] == "off"
     rig.close()

@@ -156,12 +156,6 @@ def test_servos_that_answer_reads_only_are_told_to_answer_all():
         device.check()
 
 
-def test_one_servo_confirms_its_goals():
-    with feetech(STS.robot(), (1,)) as device:
-        device.enable()
-        assert device.command(np.array([0.51])).transfer_ns == 10_000 * (9 + 6)
-
-
 def test_a_soft_stop_leaves_the_goals_where_they_are_until_all_is_still(rig_of):
     rig, robot = rig_of(stop_s=2.0, slew_per_s=3.0)
     rig.start()
@@ -260,11 +254,7 @@ def test_a_missing_servo_is_named_with_those_that_answer():
             Joint("pan", 1, homing_offset=0),
             "accepts 0 to 3000 counts only, its joint needs 0 to 4095",
         ),
-        (
-            (sts.ID, 1),
-            Joint("pan", 7),
-            r"(?s)servo 7 \(joint 'pan'\) does not answer on .* at 1000000 baud.*: \[1, 2, 3\].*hint: ",
-        ),
+        ((sts.ID, 1), Joint("pan", 7), r"(?s)servo 7 \(joint 'pan'\) does not answer on .*: \[1, 2, 3\].*hint: "),
         ((sts.STATUS, 1), Joint("pan", 1), "servo 1 reports an alarm: input voltage"),
     ],
 )
@@ -280,7 +270,6 @@ def test_servos_that_do_not_fit_their_joints(change, joint, said):
 @pytest.mark.parametrize(
     ("kind", "config", "joints", "message"),
     [
-        (DynamixelServos, {"silence_s": 3.0}, (1,), "silence_s"),
         (DynamixelServos, {"baud_rate": 1234}, (1,), r"baud rate 1234\. Available: \[9600"),
         (DynamixelServos, {}, (1, 254), "from 0 to 253"),
         (DynamixelServos, {}, (), "at least one"),
@@ -301,9 +290,7 @@ def test_configurations_that_make_no_sense(kind, config, joints, message):
         (DynamixelServos, lambda: PositionDrive(20_000), "position_p_gain = 20000 is outside"),
         (DynamixelServos, lambda: PositionDrive(800, d_gain=-1), "position_d_gain = -1 is outside"),
         (DynamixelServos, lambda: PositionDrive(800, 0.0), "speed_rad_s = 0.0 must be larger"),
-        (DynamixelServos, lambda: PositionDrive(800, math.nan), "speed_rad_s = nan must be larger"),
         (DynamixelServos, lambda: PositionDrive(800, 1000.0), "profile_velocity = .* is outside"),
-        (DynamixelServos, lambda: VoltageDrive(0.0), "supply_v"),
         (DynamixelServos, lambda: VoltageDrive(math.nan), "supply_v"),
         (StsServos, lambda: PositionDrive(255), "p_gain = 255 is outside"),
         (StsServos, lambda: VoltageDrive(5.0), "Feetech servos take no volts"),
@@ -386,8 +373,3 @@ def test_a_lost_bus_names_the_computer_if_its_own_thread_did_not_run(monkeypatch
             device.link.read(1, reg.PRESENT_POSITION)
     assert ("computer is too busy" in str(lost.value)) == (held_up_s > 0.0)
     assert ("cable" in str(lost.value)) == (held_up_s == 0.0)
-
-
-def test_a_bus_counts_as_lost_when_its_host_would_count_as_dead():
-    assert BusConfig.patient("/dev/null", 1_000_000, 2.0).max_silence_s == 2.0
-    assert BusConfig.patient("/dev/null", 1_000_000, 0.02).max_silence_s == 0.1

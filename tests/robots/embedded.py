@@ -108,13 +108,6 @@ class Pendulum(Arm):
         self.identified = replace(self.model.following(emulated.plant.truth()), delay_s=delay_s)
         emulated.stop()
 
-    def robot(self, seed, plant=None, **faults):
-        embedded = self.drive.embedded()
-        return VirtualRobot(embedded.plant(**(plant or {})), replace(embedded.emulator, seed=seed, **faults))
-
-    def device(self, robot, limits):
-        return self.drive.device(robot.port, limits.servo_watchdog_s, embedded=True)
-
     def raised(self, first):
         """Return a policy that pumps: full voltage in the direction of the motion."""
         return lambda k, reading: np.clip(4.0 * reading.velocity_rad_s + 0.6 * (k < 10), -2.0, 2.0)

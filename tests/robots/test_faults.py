@@ -163,11 +163,6 @@ def impatient_guardian(monkeypatch):
     monkeypatch.setattr(guardian, "GIVE_UP_S", 1.0)
 
 
-def test_the_table_has_its_rows():
-    assert len(ROWS) >= 160
-    assert {name for name, *_ in ROWS} == set(ROBOTS)
-
-
 @pytest.mark.parametrize(("name", "fault", "seed"), GATE)
 def test_a_fault_of_an_embedded_robot_ends_with_its_reason(name, fault, seed):
     check(name, fault, seed)
