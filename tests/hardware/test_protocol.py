@@ -68,6 +68,7 @@ GOAL = b"\x00\x08\x00\x00\xe8\x03"
     ("packet", "manual"),
     [
         (build(1, Instruction.PING), "FF FF FD 00 01 03 00 01 19 4E"),
+        (PROTOCOL.build_status(1, 0, b"\x06\x04\x26"), "FF FF FD 00 01 07 00 55 00 06 04 26 65 5D"),
         (sts(1, Instruction.PING), "FF FF 01 02 01 FB"),
         (sts(1, Instruction.READ, b"\x38\x02"), "FF FF 01 04 02 38 02 BE"),
         (sts(0xFE, Instruction.WRITE, b"\x05\x01"), "FF FF FE 04 03 05 01 F4"),

@@ -2,15 +2,17 @@
 
 import json
 
+import numpy as np
 import pytest
 import so101_person
-from wrong_arms import WrongArm
+from wrong_arms import RAD_PER_COUNT, WrongArm
 
 from sim2real.commands.new import calibrate
 from sim2real.emulation.bus import VirtualRobot
 from sim2real.emulation.feetech import StsEmulation
 from sim2real.emulation.truth import Kind
-from sim2real.errors import Sim2RealError
+from sim2real.errors import HardwareLost, Sim2RealError
+from sim2real.hardware.calibration import HandMotion
 from sim2real.hardware.device import OperatingMode
 from sim2real.stages.load import load_module, load_robot
 
@@ -19,17 +21,23 @@ GUIDE = load_module("so101", "guide")
 GOOD = json.loads((SO101.folder / "calibration.json").read_text())
 
 
+def written(folder, changes):
+    """Write LeRobot's calibration of the arm with some changes; return its path."""
+    path = folder / "lerobot.json"
+    path.write_text(json.dumps({name: entry | changes.get(name, {}) for name, entry in GOOD.items()}))
+    return path
+
+
 @pytest.fixture
 def arm(tmp_path, monkeypatch):
     """Start an embedded arm with a person, and LeRobot's calibration of it; stopped at the end of the test."""
     arms = []
 
-    def start(changes=None, emulation=None, **plant):
-        hand, file = tmp_path / "hand.npz", tmp_path / "lerobot.json"
+    def start(changes, emulation, **plant):
+        hand = tmp_path / "hand.npz"
         so101_person.write_motion(hand, begin_s=6.0, speed_rad_s=4.0)
-        file.write_text(json.dumps({name: entry | (changes or {}).get(name, {}) for name, entry in GOOD.items()}))
-        monkeypatch.setenv("SO101_CALIBRATION", str(file))
-        settings = {"homing_offset": 85, "plant_step_s": 0.001} | (emulation or {})
+        monkeypatch.setenv("SO101_CALIBRATION", str(written(tmp_path, changes)))
+        settings = {"homing_offset": 85, "plant_step_s": 0.001} | emulation
         truth = tmp_path / "truth.bin"
         arms.append(VirtualRobot(WrongArm(hand, **plant), StsEmulation(**settings), truth))
         return arms[-1]
@@ -76,12 +84,10 @@ WHOLE_MOTION = {
     "servos exchanged", "a servo mounted turned", "a direction turned in the file", "a zero that is off",
     "a horn that has slipped", "a joint at its stop when calibrated",
 }  # fmt: skip
-"""Faults that a motion of the hand shows: in the gate in test_so101_hand_motion.py, where it takes no time."""
+"""Faults that a motion of the hand shows, on the counts of the encoders, without waiting for them."""
 
 
-@pytest.mark.parametrize(
-    "fault", [pytest.param(f, marks=pytest.mark.night) if f in WHOLE_MOTION else f for f in FAULTS]
-)
+@pytest.mark.parametrize("fault", [f for f in FAULTS if f not in WHOLE_MOTION])
 def test_a_fault_is_found_before_a_motor_moves(arm, tmp_path, fault):
     plant, changes, emulation, message = FAULTS[fault]
     wrong = arm(changes, emulation, **plant)
@@ -89,3 +95,29 @@ def test_a_fault_is_found_before_a_motor_moves(arm, tmp_path, fault):
         calibrate(wrong.port, GUIDE, tmp_path / "calibration.json")
     assert modes(wrong) <= {OperatingMode.OFF}
     assert not (tmp_path / "calibration.json").exists()
+
+
+PERIOD_S, PATIENCE_S, OFFSET = 0.02, 8.0, 85
+
+
+def moved(folder, joints, **faults):
+    """Show the whole motion of a person to a motion by hand; return whether it is complete."""
+    end_s = so101_person.write_motion(folder / "hand.npz")
+    arm, motion = WrongArm(folder / "hand.npz", **faults), HandMotion(joints, GUIDE.NUDGES)
+    for t_s in np.arange(0.0, end_s + PATIENCE_S, PERIOD_S):
+        arm.advance(t_s)
+        angles = np.array([arm.measure(joint.servo_id)[0] for joint in joints])
+        if motion.feed(t_s, (np.round(angles / RAD_PER_COUNT) - OFFSET) % 4096):
+            return True
+    return False
+
+
+@pytest.mark.parametrize("fault", sorted(WHOLE_MOTION))
+def test_a_fault_contradicts_the_motion(tmp_path, fault):
+    plant, changes, _, message = FAULTS[fault]
+    with pytest.raises(HardwareLost, match=f"(?s){message}"):
+        moved(tmp_path, GUIDE.read(written(tmp_path, changes)), **plant)
+
+
+def test_a_right_calibration_and_a_whole_motion_fit(tmp_path):
+    assert moved(tmp_path, GUIDE.read(written(tmp_path, {})))

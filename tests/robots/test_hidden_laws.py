@@ -113,11 +113,11 @@ def test_auto_finds_that_the_controller_carries_the_weight(tmp_path, monkeypatch
     widest = fit(problem_of(robot_of(tmp_path, ARM), [episode], "gravcomp"))
     table, sets, simulated, ahead = widest.problem.table, [], [], held_out._ahead
     of_segment = 0.6 / STEP_S * (residuals._BESIDE + 1) * len(table)
-    monkeypatch.setattr(terms, "MOST_OF_SETS", 3 * of_segment + 1)
+    monkeypatch.setattr(terms, "MOST_OF_SETS", 4 * of_segment + 1)
     search = TermSearch(widest, folds_of(widest.problem, 3), 0.3, 0.0, sets.append)
     monkeypatch.setattr(held_out, "_ahead", lambda w, *rest: (simulated.append(len(w.train)), ahead(w, *rest))[1])
     found = search.select()
-    assert (search.segments, sets[:2], set(simulated)) == (3, ["no term", "gravcomp"], {5})
+    assert (search.segments, sets[:2], set(simulated)) == (4, ["no term", "gravcomp"], {5})
     assert found.chosen.names(table) == ("gravcomp",)
     values = table.decode(found.chosen.x, table.of_terms(found.chosen.present))
     assert float(values["gravcomp"]) == pytest.approx(SHARE, abs=0.02)
@@ -363,7 +363,7 @@ def test_a_joint_with_another_stiffness_gets_a_factor(tmp_path):
     goals, kp = np.hstack([waves(9.3, 3.1), 0.7 * np.sin(4.0 * T_S + 1.0)[:, None]]), np.array([12.0, 24.0])
     model = mujoco.MjModel.from_xml_string(text)
     episode = play(model, goals, lambda k, _, data: kp * (goals[k] - data.qpos))
-    robot = offering(robot_of(tmp_path, text, joints=("pan", "lift")), "kp_by_joint")
+    robot = robot_of(tmp_path, text, joints=("pan", "lift"))
     found = fit(problem_of(robot, [episode], "kp_by_joint"))
     # Without the factor, in the same programs.
     problem, shared = found.problem, np.array([name != "kp_of_lift_alone" for name in found.problem.table.names])
@@ -372,5 +372,5 @@ def test_a_joint_with_another_stiffness_gets_a_factor(tmp_path):
     expected = {"kp": 12.0, "kp_of_lift_alone": 2.0, "damping": 0.4}
     assert {n: found.values[n] for n in expected} == pytest.approx(expected, rel=0.05)
     # The model with these values has both stiffnesses.
-    made = mujoco.MjModel.from_xml_string(robot.exported(found.values).mjcf)
+    made = mujoco.MjModel.from_xml_string(offering(robot, "kp_by_joint").exported(found.values).mjcf)
     assert made.actuator_gainprm[:, 0] == pytest.approx(kp, rel=0.06)

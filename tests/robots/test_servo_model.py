@@ -90,6 +90,10 @@ def test_a_gear_is_in_the_model_and_not_in_the_servos_parameters(pair):
     for made in (pair, robot):  # a twin's servos are those of the data sheet, whatever their gears
         twin = ServoPlant(**made.model.twin(EmulatorConfig(), **factors).plant.keywords)
         assert twin.truth() == pytest.approx(truth, rel=1e-5)
+    with pytest.raises(UsageError, match="no factor 'mass'"):
+        pair.model.twin(EmulatorConfig(), mass=2.0)
+    with pytest.raises(UsageError, match="no joint 'neck'"):
+        ServoPlant(**{**pair.model.twin(EmulatorConfig()).plant.keywords, "joints": ["neck", "right"]})
 
 
 def test_inertia_makes_up_for_what_the_implicit_step_adds(pair):

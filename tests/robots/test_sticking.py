@@ -1,20 +1,13 @@
 """Dry friction holds a joint; MuJoCo's default impedance lets it creep, and too few iterations let it shiver."""
 
-from copy import copy
-
-import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
-from sim2real.graph.base import GraphState, InputState, StepState
-from sim2real.robots.messages import Goals
 from sim2real.robots.model.drives import driven
 from sim2real.robots.model.file import read_model
 from sim2real.robots.model.parameters import usual_patterns
 from sim2real.robots.model.robot import MjcfRobot, RobotConfig
-from sim2real.robots.servo.world import ServoParams, ServoWorld
 from sim2real.stages.load import load_robot
 
 XML = """<mujoco><worldbody><body><joint name="lift" axis="0 1 0" frictionloss="1" {own}/>
@@ -82,27 +75,3 @@ def test_an_exported_servo_robot_rests_where_friction_holds_it(name):
     assert fastest() < 1e-3
     model.opt.iterations, model.opt.ls_iterations = 1, 4
     assert fastest() > 1e-2, "few iterations do suffice: training may have them, too"
-
-
-@pytest.mark.night
-@pytest.mark.parametrize("name", ["so101", "arm"])
-def test_in_single_precision_too(name):
-    """On MJX, as beside a deployment; at an impedance of 0.999 single precision does not find the holding force."""
-    robot = load_robot(name)
-    model = copy(robot.model.model)
-    model.opt.gravity[:] = 0.0
-    profiles = [robot.model.profile_rad_s] * model.nq
-    world = ServoWorld(model, robot.drive.servos.names, robot.model.tick_s, profiles)
-    world.solve_to_rest()
-    fields = robot.model.fields(robot.nominal()) | {"dof_frictionloss": jnp.full(model.nv, 0.2)}
-    params = ServoParams(fields, jnp.zeros(model.nq), jnp.zeros(model.nv))
-    goal = Goals((0.16 / fields["actuator_gainprm"][:, 0])[None])
-    heard = {"actuator": InputState(jnp.zeros(1, jnp.int32), jnp.zeros(1), jnp.zeros(1), goal)}
-
-    def step(state, seq):
-        after = world.step(StepState(state=state, params=params, inputs=heard, seq=seq))[0].state
-        return after, after.data.qvel
-
-    start = world.init_state(None, GraphState(params={"world": params}))
-    speeds = np.asarray(jax.jit(lambda s: jax.lax.scan(step, s, jnp.arange(200))[1])(start))
-    assert np.abs(speeds[100:]).max() < 5e-3
