@@ -4,7 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 from flax import struct
+from mujoco import mjx
 
+from sim2real.composer.physics.mjx import stepping
 from sim2real.errors import UsageError
 from sim2real.graph import Base, BaseNode
 from sim2real.graph.schedule import draw
@@ -47,6 +49,18 @@ def test_a_push_changes_velocities_and_nothing_else():
     pushed = world.with_velocity(state, world.velocity(state) + jnp.array([0.5, 0.0]))
     np.testing.assert_allclose(pushed.qvel, [1.5, -1.0])
     np.testing.assert_array_equal(pushed.qpos, state.qpos)
+
+
+@pytest.mark.parametrize("friction", [0.0, 1e-44])
+def test_a_joint_whose_friction_is_taken_away_coasts(friction):
+    """Also to what underflows in single precision, as where friction wears off with speed: MJX braked it hard."""
+    model = mujoco.MjModel.from_xml_string(ARM.format(option='gravity="0 0 0"', actuator="").replace("0.05", "0"))
+    model.dof_frictionloss[:] = 0.1
+    rough = mjx.put_model(model, impl="jax")
+    smooth = rough.replace(dof_frictionloss=jnp.full(2, friction))
+    data = mjx.make_data(model, impl="jax").replace(qvel=jnp.array([1.0, 0.0]))
+    speeds = [float(stepping.JaxEngine().advance(own, data, legacy=False).qvel[0]) for own in (rough, smooth)]
+    assert speeds[1] == pytest.approx(1.0, abs=0.01) != pytest.approx(speeds[0], abs=0.01)
 
 
 def test_a_rollout_is_that_of_c_mujoco_under_the_same_commands():

@@ -6,7 +6,7 @@ for a batch or for a derivative. That shortens compilation.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol, TypeVar, cast
+from typing import TYPE_CHECKING, Final, Protocol, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from sim2real.types import PyTree
 
 T = TypeVar("T", mjx.Model, mjx.Data)
+
+_LEAST_FRICTION: Final = 1e-12
+"""Dry friction that moves nothing [N m], and does not underflow in single precision."""
 
 
 def with_fields(tree: T, values: dict[str, PyTree]) -> T:
@@ -101,7 +104,9 @@ def _positions(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Compute the quantities of positions and velocities, and set the state as MuJoCo does.
 
     MJX writes quaternions back normalized, and has velocities of actuators that are switched off; MuJoCo has zeros.
+    A joint that was compiled with dry friction, and has none or one that underflows, MJX brakes without a limit.
     """
+    model = with_fields(model, {"dof_frictionloss": jnp.maximum(model.dof_frictionloss, _LEAST_FRICTION)})
     qpos = data.qpos
     data = mjx.sensor_pos(model, mjx.fwd_position(model, data))
     data = mjx.fwd_velocity(model, data)
