@@ -2,7 +2,9 @@ from functools import cached_property
 
 import plants
 
-from sim2real.emulation.robot import Emulation, PlannedRobot, VirtualTime, truth_header
+from sim2real.emulation.bus import VirtualRobot
+from sim2real.emulation.dynamixel import EmulatorConfig
+from sim2real.emulation.robot import truth_header
 from sim2real.emulation.truth import TruthLog, read_truth
 from sim2real.hardware.device import Device
 
@@ -51,38 +53,12 @@ class VirtualBus:
         return read_truth(self._path)
 
 
-class Idle(PlannedRobot):
-    def next_due_ns(self):
-        return None
-
-    def run_until(self, t_ns): ...
-
-
-class IdleEmulation(Emulation):
-    def planned(self, physics, truth, send):
-        return Idle(self, truth)
-
-
-class Nothing:
-    def state(self):
-        return {}
-
-    truth = state
-
-
-class IdleTime(VirtualTime):
-    """Virtual time in which nothing happens by itself."""
-
-    def __init__(self):
-        super().__init__(Nothing(), IdleEmulation(), None, None)
-
-
 class IdleDevice(Device):
     """A device without hardware, in virtual time: opening, torque and checks do nothing."""
 
     @cached_property
     def clock(self):
-        return IdleTime()
+        return VirtualRobot(plants.Ramp(), EmulatorConfig())
 
     def open(self): ...
     def close(self): ...

@@ -17,7 +17,6 @@ from sim2real.errors import SafetyStop, UsageError
 from sim2real.hardware.clock import SYSTEM_CLOCK
 from sim2real.hardware.safety.gate import GateLimits
 from sim2real.robots.walking.drive import StandUp
-from sim2real.robots.walking.twin import twin_of
 
 pytest.importorskip("cyclonedds")
 
@@ -167,16 +166,6 @@ def test_a_robot_that_tips_over_is_stopped_while_it_stands_up():
 
     with pytest.raises(SafetyStop, match="tipped over"):
         ROBOT.drive.begin(Rig())
-
-
-def test_identified_values_are_those_of_the_twin():
-    values = {**ROBOT.nominal(), "foot_friction": 0.5, "payload": 1.0, "motor_strength": 0.9}
-    values |= {f"{part}_damping": 0.3 for part in ROBOT.groups}
-    twin = twin_of(ROBOT, {**values, "sensor_delay": 0.004, "actuator_delay": 0.006})
-    assert twin.model.geom_friction[0, 0] == 0.5
-    assert twin.hidden.acting_s == pytest.approx(0.009)
-    np.testing.assert_allclose(twin.model.actuator_gainprm[:, 0], 35.0 * 0.9)
-    np.testing.assert_allclose(twin.model.dof_damping[6:], 0.3)
 
 
 def test_the_score_of_a_walk_compares_at_the_times_of_the_commands():

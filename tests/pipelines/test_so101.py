@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from sim2real.errors import UsageError
-from sim2real.hardware import feetech as registers
 from sim2real.stages.load import load_module, load_robot
 from sim2real.stages.session.excitation import excitation
 
@@ -69,15 +68,6 @@ def test_each_joint_has_its_own_damping_friction_and_limit():
     np.testing.assert_allclose(model["dof_frictionloss"], [0.06] * 5 + [0.02], rtol=1e-6)
     most = [2.94] * 4 + [gain * values["saturation_wrist_roll"], gain * 0.1]
     np.testing.assert_allclose(model["actuator_forcerange"][:, 1], most, rtol=1e-5)
-
-
-def test_the_data_sheets_torque_is_reached_at_an_error_of_a_third_of_a_radian():
-    """P gain of 16, 0.166 duty per radian and count of P: 30 kg cm at 0.377 rad."""
-    sheet = ROBOT.drive.servos.sheet
-    assert sheet.full_rad == pytest.approx(0.3765, abs=1e-4)
-    assert sheet.gain == pytest.approx(7.81, abs=0.01)
-    assert sheet.drive.p_gain == 16
-    assert registers.FAMILY.fixed[registers.ACCELERATION] == 0, "as fast as it can"
 
 
 @pytest.fixture

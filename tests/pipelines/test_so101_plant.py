@@ -99,13 +99,6 @@ def test_without_torque_it_stays_folded_and_elsewhere_sinks_to_the_table():
     assert np.abs(plant.data.qpos - REST).max() < 0.25, "and can be folded again"
 
 
-def test_it_is_measured_in_the_encoders_angle():
-    plant = at(SO101Plant(), 0.1, -0.5, 0.6, -1.1, 0.2, 0.3)
-    measured = [plant.measure(i) for i in plant.servo_ids]
-    np.testing.assert_allclose([m[0] for m in measured], plant.data.qpos + ZERO)
-    assert {m[1:] for m in measured} == {(0.0, 0.0)}
-
-
 def test_it_imports_no_jax():
     code = f"""
 import runpy, sys

@@ -64,14 +64,10 @@ def entry(**changes):
         ("{", "Input data was truncated"),
         ([1], "Expected `object`, got `array`"),
         ({}, "holds no motors"),
-        ({"elbow": 3}, "Expected `object`, got `int`"),
         (entry(homing_offset=None), "Object missing required field `homing_offset`"),
         (entry(gear=2), "unknown field `gear`"),
-        (entry(id="1"), "Expected `int`, got `str` - at `$[...].id`"),
         (entry(drive_mode=True), "Expected `int`, got `bool` - at `$[...].drive_mode`"),
-        (entry(homing_offset=2048), "Expected `int` <= 2047 - at `$[...].homing_offset`"),
         (entry(range_max=4096), "Expected `int` <= 4095 - at `$[...].range_max`"),
-        (entry(range_min=100.5), "Expected `int`, got `float` - at `$[...].range_min`"),
         (entry(range_min=4000), "range_min = 4000 is not below range_max = 4000"),
         (entry() | {"wrist": entry()["elbow"]}, "motors 'elbow' and 'wrist' both have id 1"),
     ],
@@ -80,11 +76,8 @@ def test_what_is_wrong_with_a_file_is_said(written, content, said):
     with pytest.raises(UsageError) as raised:
         read_calibration(written(content))
     assert said in str(raised.value)
-
-
-def test_a_file_that_is_not_there(tmp_path):
     with pytest.raises(UsageError, match=r"(?s)none.json cannot be read.*lerobot-calibrate"):
-        read_calibration(tmp_path / "none.json")
+        read_calibration(written(content).with_name("none.json"))
 
 
 @pytest.mark.parametrize("bad", [{"direction": 0}, {"low_count": 9, "high_count": 9}])
