@@ -10,7 +10,10 @@ from hypothesis import strategies as st
 
 from sim2real.errors import SafetyStop
 from sim2real.hardware.device import Following
+from sim2real.hardware.joint import Joint
 from sim2real.hardware.safety.following import FollowingCheck
+from sim2real.hardware.safety.gate import GateConfig
+from sim2real.hardware.safety.rig import Rig
 
 GATE = {"limit": 1.5, "slew_per_s": 20.0}
 START = np.array([0.5, -0.8, 0.3])
@@ -40,6 +43,9 @@ def test_a_joint_at_rest_may_be_moved_off_its_goal_by_less_than_nearly_all_of_th
     with ANGLES.rig(robot) as rig:
         # 885 counts of PWM at a P gain of 800: 283 counts of error, 0.434 rad.
         assert float(rig.following.limit[0]) == pytest.approx(0.9 * 0.4344, abs=1e-4)
+    geared = [Joint("pan", gear=2.0), Joint("lift"), Joint("tip")]
+    with Rig(ANGLES.device(robot), GateConfig(**ANGLES.gate), geared) as rig:
+        assert rig.following.limit[:2] == pytest.approx(0.9 * 0.4344 / np.array([2.0, 1.0]), abs=1e-4)
     robot.stop()
 
 
@@ -91,6 +97,41 @@ def test_a_weak_motor_is_named_by_its_missing_torque():
         let_go(check, still, 0.1, 0.2)
 
 
+def swung(lets_go_s=math.inf, limit=0.1, seed=0):
+    """Play random pushes on a joint whose acceleration is known, 30 ms late, and measure it at uneven times.
+
+    Returns:
+        When it was stopped [s], or None.
+    """
+    rng, delay_s = np.random.default_rng(seed), 0.03
+    push = lambda q, v, u: (-2.0 * v, 10.0 * u, np.full(1, 0.1))  # noqa: E731
+    check = FollowingCheck(Following(limit, 0.35, push=push, delay_s=delay_s), np.zeros(1), 0.0, str)
+    q, v, due_s, sent = 0.0, 0.0, 0.004, [(-1.0, 0.0)]
+    for k in range(20_000):
+        t_s = 1e-4 * k
+        if k % 700 == 0:
+            sent.append((t_s, rng.choice([-3.0, 3.0])))
+            check.sending(np.array([sent[-1][1]]), t_s)
+            check.sent(t_s)
+        acting = [u for since_s, u in sent if since_s <= 1e-4 * k - delay_s][-1]
+        if t_s >= due_s:
+            due_s = t_s + rng.uniform(0.005, 0.02)
+            try:
+                check.check(np.array([q]), np.array([v]), np.zeros(1), t_s)
+            except SafetyStop:
+                return t_s
+        v += 1e-4 * (10.0 * acting * (t_s < lets_go_s) - 2.0 * v)
+        q += 1e-4 * v
+    return None
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_joint_that_lacks_its_push_is_stopped_and_one_that_has_it_is_not(seed):
+    """A tenth of a push that is missing is seen, so times of commands and changes of speed are right."""
+    assert swung(seed=seed) is None
+    assert 1.0 < swung(1.0, 0.3, seed) < 1.5
+
+
 def test_a_command_that_is_held_up_on_its_way_is_not_obeyed_yet():
     """A busy computer may stop a thread between its decision to send a goal and the port."""
     following = Following(0.1, 0.2, 2.0)
@@ -124,9 +165,10 @@ def test_each_sender_begins_near_the_measured_pose(family):
     with family.rig(robot, GATE) as rig:
         rig.start()
         rig.command(START + 0.4, 0.0, 0.0)
-        rig.command(START - 0.4, 0.0, 0.02)  # the second command is the gate's to limit
+        rig.command(START - 0.6, 0.0, 0.02)  # the second command is the gate's to limit
+        rig.command(START + 0.4, 0.0, 0.04)
         rig.measure()
         rig.hand_over()
-        with pytest.raises(SafetyStop):
-            rig.command(START - 0.6, 0.0, 0.04)
+        with pytest.raises(SafetyStop):  # it is near what was sent last
+            rig.command(START + 0.7, 0.0, 0.06)
     robot.stop()

@@ -136,7 +136,9 @@ def test_limits_that_make_no_sense_are_refused(config, message):
 def test_limits_of_a_stage_are_refused_and_become_those_of_a_gate(limits):
     with pytest.raises(UsageError, match=next(iter(limits))):
         GateLimits(**limits)
-    gate = GateLimits(envelope_rad=(-1.0, 2.0), stop_s=0.3, max_sample_age_s=0.4).gate(1.0, joints=("a",))
+    gate = GateLimits(envelope_rad=(-1.0, 2.0), stop_s=0.3, max_sample_age_s=0.4, servo_watchdog_s=0.02).gate(
+        1.0, joints=("a",)
+    )
     assert (gate.envelope_rad, gate.stop_s, gate.max_sample_age_s) == ((-1.0, 2.0), 0.3, 0.4)
     assert (gate.slew_per_s, gate.joints) == (400.0, ("a",))
 

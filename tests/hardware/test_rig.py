@@ -104,7 +104,7 @@ def test_a_soft_stop_fades_the_voltage_before_the_torque_goes_off(open_rig):
     rig.start()
     run(rig, 3.0, 0.3)
     sent, took_s = eased(rig, np.full(3, 3.0), 0.02)
-    assert took_s < 0.6
+    assert took_s < 0.5, "it is still before the longest time is over"
     assert np.all(np.diff(sent, axis=0) <= 0.0)
     assert len({*sent[:, 0]}) >= 5, "it fades, it does not drop"
     assert sent[-1, 0] == 0.0
