@@ -37,7 +37,7 @@ def test_a_package_brings_a_device_by_an_entry_point(installed):
     ("name", "message"),
     [
         ("od", r"unknown device 'od'\. Available: .*dynamixel.*odd(.|\n)*entry point group 'sim2real.devices'"),
-        ("number", r"device 'number' \(odd_motors:NUMBER\) is int, not a callable"),
+        ("number", r"'number' \(odd_motors:NUMBER\) is int, not a callable"),
         ("gone", r"device 'gone' \(odd_motors:Gone\) cannot be imported"),
     ],
 )

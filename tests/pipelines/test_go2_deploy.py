@@ -23,7 +23,7 @@ pytest.importorskip("cyclonedds")
 GUIDE = Path(__file__).parents[2] / "docs/guides/walk.md"
 
 
-@pytest.mark.night  # `make test` drives the device in test_unitree_device.py, and walks in test_rough_ground.py
+@pytest.mark.night  # `make test` drives the device in test_unitree_device.py, and walks in test_walking.py
 def test_the_shipped_policy_walks_and_lies_down(tmp_path, capsys):
     (command,) = re.findall(r"^    sim2real (deploy .*)$", GUIDE.read_text(), re.MULTILINE)
     assert cli.main([*shlex.split(command), "--runs", str(tmp_path)]) == 0

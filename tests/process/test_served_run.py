@@ -19,16 +19,8 @@ pytest.importorskip("rerun")
 @pytest.mark.night
 @pytest.mark.parametrize("follow", [True, False])
 def test_a_run_is_served_to_browsers_until_ctrl_c(run_copy, follow):
-    command = [
-        sys.executable,
-        "-m",
-        "sim2real.cli",
-        "report",
-        str(run_copy),
-        "--rerun",
-        "web",
-        *(["--follow"] if follow else []),
-    ]
+    flags = ["--rerun", "web", *(["--follow"] if follow else [])]
+    command = [sys.executable, "-m", "sim2real.cli", "report", str(run_copy), *flags]
     environment = {**os.environ, "RERUN_ANALYTICS_ENABLED": "0"}
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment) as process:
         said = ""

@@ -197,23 +197,15 @@ def test_facts_about_the_hardware_come_from_the_log():
     registers = {
         "firmware": {"servo 1": "3.9", "servo 2": "3.10", "servo 3": "3.9"},
         "voltage": {"servo 1": "7.4 V", "servo 2": "7.4 V", "servo 3": "7.4 V"},
+        "temperature": {"battery": "30 °C"},
     }
-    measured = {"battery_voltage": np.array([29.6, 28.1]), "position": np.zeros(2)}
-    units = {"sensor": {"battery_voltage": "V"}}
     servos = Episode(steps={}, messages={}, outputs={}, metadata={"hardware": registers})
-    assert facts_of(servos, "sensor") == {
-        "firmware": "3.9: servo 1, servo 3; 3.10: servo 2",
-        "voltage": "7.4 V, all motors",
-        "temperature": "not recorded",
-    }
-    alone = {"hardware": {"firmware": {"battery": "1.4"}}}
-    assert facts_of(Episode(steps={}, messages={}, outputs={}, metadata=alone), "sensor")["firmware"] == "1.4: battery"
+    said = ("3.9: servo 1, servo 3; 3.10: servo 2", "7.4 V, all motors", "30 °C: battery")
+    assert facts_of(servos, "sensor") == dict(zip(registers, said, strict=True))
+    measured, units = {"battery_voltage": np.array([29.6, 28.1])}, {"sensor": {"battery_voltage": "V"}}
     legs = Episode(steps={}, messages={}, outputs={"sensor": measured}, metadata={}, units=units)
-    assert facts_of(legs, "sensor") == {
-        "firmware": "not recorded",
-        "temperature": "not recorded",
-        "battery_voltage": "28.1 to 29.6 V",
-    }
+    said = {"firmware": "not recorded", "temperature": "not recorded", "battery_voltage": "28.1 to 29.6 V"}
+    assert facts_of(legs, "sensor") == said
 
 
 @pytest.mark.night

@@ -71,7 +71,7 @@ def test_an_embedded_robot_does_the_same_each_time(tmp_path):
 
 
 def test_a_dry_run_sends_nothing_that_moves_and_is_no_recording(tmp_path):
-    """What a device without torque writes to its bus is in tests/hardware/test_withheld.py."""
+    """What a device without torque writes to its bus is in tests/hardware/test_rig.py."""
     flags = ["--duration-s", 1, "--amplitude", 2, "--gate.slew-per-s", 5]
     code, said, folder = call(tmp_path, "record", "pendulum", "--dry-run", *flags)
     assert code == 0
