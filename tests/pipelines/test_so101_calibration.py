@@ -75,7 +75,7 @@ FAULTS = {
     "a horn that has slipped": ({"slipped": 1}, {}, {}, r"shoulder_pan turns at least \d+ degrees beyond"),
     "a joint at its stop when calibrated": (
         {}, {"wrist_flex": {"range_min": 1842, "range_max": 3672}}, {},
-        r"in the middle pose .*: wrist_flex -\d+ degrees",
+        r"in the middle pose .*wrist_flex -\d+ degrees",
     ),
 }  # fmt: skip
 
