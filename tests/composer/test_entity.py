@@ -55,6 +55,16 @@ def test_a_pose_is_set_in_parts_and_moved(placed):
     position, quaternion = ball.get_pose(physics)
     np.testing.assert_allclose(position, [1, 2, 4])
     np.testing.assert_allclose(quaternion, [0, 0, 0, 1], atol=1e-12)
+    physics.forward()
+    np.testing.assert_allclose(ball.global_vector_to_local_frame(physics, [1, 2, 3]), [-1, -2, 3], atol=1e-12)
+    np.testing.assert_allclose(ball.global_vector_to_local_frame(physics, [1, 2]), [-1, -2], atol=1e-12)
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    np.testing.assert_allclose(ball.global_xmat_to_local_frame(physics, turn), turn.T, atol=1e-12)
+    np.testing.assert_allclose(ball.global_xmat_to_local_frame(physics, turn.ravel()), turn.T.ravel(), atol=1e-12)
+    for wrong in (lambda: ball.global_vector_to_local_frame(physics, [1]),
+                  lambda: ball.global_xmat_to_local_frame(physics, np.eye(4))):  # fmt: skip
+        with pytest.raises(UsageError, match="should have shape"):
+            wrong()
     with pytest.raises(RuntimeError, match="No attachment frame found"):
         Ball().get_pose(physics)
 

@@ -190,6 +190,18 @@ def test_specs():
     assert env.reset().observation["angle"].shape == (1,)
 
 
+@pytest.mark.parametrize("padding", composer.ObservationPadding)
+def test_what_is_late_is_padded(padding):
+    late = observable.Generic(lambda physics: 7.0, delay=4, buffer_size=2)
+    late.enabled = True
+    task = type("Late", (Swing,), {"task_observables": {"late": late}})()
+    env = composer.Environment(task, delayed_observation_padding=padding)
+    first = 7.0 * (padding is composer.ObservationPadding.INITIAL_VALUE)
+    seen = [env.reset(), *(env.step([0.0, 0.0]) for _ in range(4))]
+    assert seen[0].observation["late"].ravel().tolist() == [first] * 2
+    assert seen[-1].observation["late"].ravel().tolist() == [7.0] * 2
+
+
 def test_wrong_arguments_are_named():
     with pytest.raises(UsageError, match="ObservationPadding"):
         composer.Environment(Swing(), delayed_observation_padding="zero")

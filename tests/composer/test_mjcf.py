@@ -187,13 +187,14 @@ def test_settings_are_those_of_the_whole_world(oracle):
 def test_units_travel_with_the_model(caplog):
     part = """<mujoco model="p"><!-- <compiler angle="radian"/> -->
       <default><joint range="-9 9" limited="true"/></default>
-      <worldbody><body euler="0 90 0"><joint name="h"/><joint name="s" type="slide"/><geom size=".1"/></body>
-      </worldbody></mujoco>"""
+      <worldbody><body euler="0 90 0"><joint name="h"/><joint name="s" type="slide"/><geom size=".1"/>
+        <site axisangle="0 1 0 90"/></body></worldbody></mujoco>"""
     world = composer.Arena().mjcf_model
     world.attach(mjcf.from_xml_string(part))
     model = world.compile()
     assert model.jnt_range[:, 1].tolist() == pytest.approx([np.radians(9), 9.0])
     np.testing.assert_allclose(model.body_quat[model.jnt_bodyid[0]], [0.5**0.5, 0, 0.5**0.5, 0], atol=1e-12)
+    np.testing.assert_allclose(model.site_quat[0], [0.5**0.5, 0, 0.5**0.5, 0], atol=1e-12)
     assert "unit" in caplog.text
     caplog.clear()
     told = mjcf.from_xml_string(part)
@@ -252,19 +253,61 @@ def test_a_keyframe_of_the_whole_world_sets_all_models(attach_first):
         keyed(attach_first, qpos=[0.5, 0.1])
 
 
-@pytest.mark.parametrize("attached", [False, True])
-def test_numbers_of_a_keyframe_stay_with_elements_that_move(attached):
-    rest = '<actuator><motor name="u" joint="j"/><motor name="v" joint="k"/></actuator>'
-    rest += '<keyframe><key name="home" ctrl="1 2" qpos=".5 -.3"/></keyframe>'
-    part = robot(beside=rest)
-    part.find("actuator", "u").remove()
-    part.actuator.add("motor", name="u", joint="j")
-    if attached:
-        composer.Arena().mjcf_model.attach(part).add("joint", type="slide", name="rail")
+WITH_STATES = """<mujoco model="r"><worldbody>
+  <body name="a"><joint name="slide" type="slide"/><joint name="ball" type="ball"/><geom size=".1"/>
+    <body name="b"><joint name="hinge"/><geom size=".1"/></body></body>{body}</worldbody>
+  <actuator><intvelocity name="i" joint="hinge" actrange="-1 1"/><motor name="u" joint="slide"/>
+    <general name="f" joint="hinge" dyntype="filter" dynprm="1"/><cylinder name="c" joint="slide"/></actuator>
+  <keyframe><key name="home" qpos=".1 .5 .5 .5 -.5 .2" qvel="1 2 3 4 5" act=".3 .4 .6" ctrl="6 7 8 9" {pose}/>
+  </keyframe></mujoco>"""
+MOCAP = {"body": '<body name="m" mocap="true"/>', "pose": 'mpos="1 2 3" mquat="0 1 0 0"'}
+ROWS = {
+    "qpos": ("joint", ("slide", "ball", "hinge")), "qvel": ("joint", ("slide", "ball", "hinge")),
+    "act": ("actuator", "ifc"), "ctrl": ("actuator", "iufc"), "mpos": ("body", "m"), "mquat": ("body", "m"),
+}  # fmt: skip
+
+
+def numbers_of_a_keyframe(model, prefix=""):
+    """Return what the first keyframe says of each element of the model above."""
+    found = {}
+    for field, (kind, called) in ROWS.items():
+        for name in called if kind != "body" or model.nmocap else ():
+            number = getattr(model, kind)(prefix + name).id
+            begin, width = {
+                "qpos": lambda n: (model.jnt_qposadr[n], (7, 4, 1, 1)[model.jnt_type[n]]),
+                "qvel": lambda n: (model.jnt_dofadr[n], (6, 3, 1, 1)[model.jnt_type[n]]),
+                "act": lambda n: (model.actuator_actadr[n], 1),
+                "ctrl": lambda n: (model.actuator_ctrladr[n], 1),
+                "mpos": lambda n: (3 * model.body_mocapid[n], 3),
+                "mquat": lambda n: (4 * model.body_mocapid[n], 4),
+            }[field](number)
+            found[field, name] = getattr(model, f"key_{field}")[0].ravel()[begin : begin + width].tolist()
+    return found
+
+
+@pytest.mark.parametrize("moved", ["", "actuators", "attached", "behind another"])
+def test_numbers_of_a_keyframe_stay_with_elements_that_move(moved):
+    mocap = {} if moved.startswith(("attached", "behind")) else MOCAP  # such a body stands in the world only
+    text = WITH_STATES.format(**(dict.fromkeys(MOCAP, "") | mocap))
+    part, alone = mjcf.from_xml_string(text), mujoco.MjModel.from_xml_string(text)
+    if moved == "actuators":
+        part.find("actuator", "i").remove()
+        part.actuator.add("intvelocity", name="i", joint="hinge", actrange=[-1, 1])
+        part.find("actuator", "u").remove()
+        part.actuator.insert("motor", 0, name="u", joint="slide")
+    elif moved == "attached":
+        composer.Arena().mjcf_model.attach(part).add("freejoint")
+    elif moved == "behind another":
+        other = mjcf.from_xml_string(text.replace('model="r"', 'model="first"'))
+        other.find("key", "home").remove()
+        for model in (other, part):
+            (other if model is part else mjcf.RootElement(model="w")).attach(model)
+    prefix = {"attached": "r/", "behind another": "first/r/"}.get(moved, "")
     model = part.root_model.compile()
-    called = [model.actuator(i).name.removeprefix("r/") for i in range(2)]
-    assert dict(zip(called, model.key_ctrl[0].tolist(), strict=True)) == {"u": 1.0, "v": 2.0}
-    assert model.key_qpos[0].tolist() == [0.0] * attached + [0.5, -0.3]
+    assert model.nkey == 1
+    assert numbers_of_a_keyframe(model, prefix) == numbers_of_a_keyframe(alone)
+    if moved == "behind another":
+        assert model.key_qpos[0, :6].tolist() == model.qpos0[:6].tolist()
 
 
 # -- what only documents can hold, and files

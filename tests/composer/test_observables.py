@@ -72,6 +72,8 @@ def test_observables_are_enabled_and_configured_by_name_or_all_at_once():
     step = composer.Environment(composer.NullTask(rod)).reset()
     assert {k: float(np.ravel(v)[0]) for k, v in step.observation.items()} == {"angle": 0.0, "height": 1.0}
     assert composer.observable(lambda physics: physics.time()).takes_physics
+    assert observables.dict_keys.angle in step.observation
+    assert observables.get_observable(observables.dict_keys.angle, name_fully_qualified=True) is observables.angle
     observables.add_observable("time", lambda physics: physics.time(), enabled=False)
     enabled = lambda: {n: o.enabled for n, o in observables.as_dict(fully_qualified=False).items()}  # noqa: E731
     assert not enabled()["time"]
