@@ -41,6 +41,8 @@ def test_props_do_not_touch_and_stay_in_their_region(world):
         gaps = np.linalg.norm(found[:, None] - found[None], axis=-1)[np.triu_indices(3, 1)]
         assert gaps.min() > 2 * RADIUS
         assert found[:, 2].min() > 0
+        for sphere in spheres:
+            np.testing.assert_array_equal(sphere.get_pose(physics)[1], [1, 0, 0, 0])
     assert physics.model.geom_contype.tolist() == [1, 1, 1, 1]
 
 
