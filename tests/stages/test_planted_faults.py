@@ -152,7 +152,7 @@ def test_a_faulty_log_is_rejected_with_the_second_of_the_fault(name, tmp_path, m
     result = identified(*log())
     assert result["verdict"]["status"] != "accepted"
     worst = result["worst"]
-    assert worst["name"] in joints
+    assert worst["joint"] in joints
     assert BEGIN_S - 0.5 <= worst["begin_s"] <= end_s - 0.5
 
 
@@ -165,5 +165,5 @@ def test_a_fault_in_the_fitted_part_is_refused_and_named(tmp_path, monkeypatch, 
     result = identified(t, goal, q)
     assert result["verdict"]["status"] == "change the model"
     said = capsys.readouterr().err
-    begin_s = float(re.search(r"not explain elbow in the second from (\d+\.\d) s on", said)[1])
+    begin_s = float(re.search(r"joint elbow, (\d+\.\d) s of run", said)[1])
     assert 4.0 <= begin_s <= 4.7
