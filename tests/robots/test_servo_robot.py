@@ -83,5 +83,6 @@ def test_a_recording_begins_where_the_joints_are_and_plays_around_the_middle(pai
     np.testing.assert_array_equal(played[16:, 1], signal[16:, 1])
     middle = replace(SERVOS, middle=(1.0, -0.3))
     agent = recording_nodes(PairRobot(middle), rig, signal)["agent"]
-    played = np.array([agent.step(SimpleNamespace(seq=k))[1].command for k in range(100)])
-    np.testing.assert_allclose(played, signal + np.array([1.0, -0.3]))
+    played = np.array([agent.step(SimpleNamespace(seq=k))[1].command for k in range(120)])
+    np.testing.assert_allclose(played[:100], signal + np.array([1.0, -0.3]))
+    np.testing.assert_allclose(played[100:], np.tile(played[99], (20, 1)))  # it waits where it ends
