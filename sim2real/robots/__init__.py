@@ -1,1 +1,1 @@
-"""Robots made of servos on a bus: everything that the stages need except the robot's model and its task."""
+"""Robots: what the stages need of a robot, and ready-made kinds (servo arms, walking robots, model and log)."""

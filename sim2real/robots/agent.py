@@ -1,7 +1,7 @@
-"""The policy's node: it shows a policy what was measured and a short history, and makes commands of its actions.
+"""The policy's node: makes observations from measurements and a short history, and commands from actions.
 
-``observe`` and ``act`` compute with the type of their arguments: JAX in a compiled graph, numpy on the wall clock,
-where a call of JAX for each small array would take longer than the policy.
+``observe`` and ``act`` compute with the type of their arguments: JAX in a compiled graph; numpy on the wall clock,
+where calls of JAX for small arrays would take longer than the policy.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class AgentState(Base):
     Attributes:
         command: Shape ``(n,)``: the last command, such as goals [rad].
         last: Shape ``(actions,)``: the last action.
-        before: Shape ``(actions,)``: the action before that one.
+        before: Shape ``(actions,)``: the action before ``last``.
         past: Shape ``(history, row)``: the last steps, newest first.
         carry: State of a policy with memory.
     """
@@ -63,15 +63,15 @@ class AgentState(Base):
 
 
 class PolicyAgent(BaseNode):
-    """The policy's node; subclasses say what it sees, what an action is, and what is remembered of a step.
+    """The policy's node; subclasses define the observation, the command of an action, and the history's rows.
 
-    The observation has the features of now, then those columns of the history that belong together, newest first.
+    The observation has the present features, then the history, column by column, each with the newest step first.
 
     Args:
-        actions: Number of actions, which is that of the commands.
+        actions: Number of actions, and of commands.
         columns: Widths of the parts of a row of the history.
-        aims: Number of an episode's numbers that the aim depends on: its entries, if it does not move.
-        at: The aim for these numbers and a time [s]; None: they are the aim.
+        aims: Number of random numbers of an episode that determine the aim.
+        at: Returns the aim for these numbers and a time [s]; None: the numbers are the aim.
     """
 
     def __init__(
@@ -91,14 +91,14 @@ class PolicyAgent(BaseNode):
 
     @abstractmethod
     def features(self, reading: PyTree, step_state: StepState) -> Array:
-        """Return the policy's features of now, ``(features,)``."""
+        """Return the present features, ``(features,)``."""
 
     def command(self, before: Array, action: Array) -> Array:
         """Return the command ``(n,)`` of an action ``(actions,)``; default: the action."""
         return action
 
     def row(self, reading: PyTree, features: Array, command: Array, action: Array) -> Array:
-        """Return what is remembered of a step, ``(row,)``; default: the features."""
+        """Return the step's row of the history, ``(row,)``; default: the features."""
         return features
 
     def shown(self, features: Array, step_state: StepState) -> Array:
@@ -106,7 +106,7 @@ class PolicyAgent(BaseNode):
         return features
 
     def aim(self, step_state: StepState) -> Array:
-        """Return the aim ``(k,)`` at a step; its time is that of the schedule, on the robot as in simulation."""
+        """Return the aim ``(k,)`` at the step's scheduled time, on the robot as in simulation."""
         aim = step_state.params.aim
         return aim if self._at is None else self._at(aim, step_state.seq / self.rate)
 
@@ -173,7 +173,7 @@ class GoalAgent(PolicyAgent):
     Args:
         low: Shape ``(joints,)``: lowest goals [rad].
         high: Shape ``(joints,)``: highest goals [rad].
-        features: Features of now: (reading, goals, aim) -> ``(features,)``.
+        features: Returns the present features: (reading, goals, aim) -> ``(features,)``.
     """
 
     def __init__(

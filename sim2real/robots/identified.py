@@ -1,4 +1,4 @@
-"""Robots of recordings: recorded commands drive a world, and a sensor reads it."""
+"""Robots that were only recorded: recorded commands drive a world, and a sensor reads it."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ class LoggedRobot(RecordedRobot):
 
     Attributes:
         channels: The measured quantities of each joint.
-        delayed: The chain with the estimated delay, e.g. ``"goal to angle"``.
-        tick_s: The world's period, where samples fall between its ticks: the sensor then needs a tick of delay to
-            interpolate. 0 where samples fall on ticks.
-        burst: Extra commands in a delay's window, for commands that came faster than their rate.
-        mapping: Mapping of its logs of other recorders, if it has no folder; a folder has an ``import.toml``.
+        delayed: From where to where the estimated delay counts, e.g. ``"goal to angle"``.
+        tick_s: The world's period [s] if samples fall between its ticks: the sensor then needs a tick of delay to
+            interpolate. 0 if samples fall on ticks.
+        burst: Extra commands in the window of the delay, for commands that came faster than their rate.
+        mapping: Mapping for logs of other recorders; default: ``import.toml`` in the robot's folder.
     """
 
     channels: tuple[Channel, ...]
@@ -57,7 +57,7 @@ class LoggedRobot(RecordedRobot):
         return {**params, WORLD: params[WORLD].replace(start=start)}
 
     def with_optional_terms(self, wanted: str) -> LoggedRobot:
-        """Return the robot with further optional terms; default: the robot, which has all of them.
+        """Return the robot with further optional terms; default: the robot itself, which has all terms.
 
         Args:
             wanted: ``auto``, ``all``, or names separated by commas.
@@ -65,7 +65,7 @@ class LoggedRobot(RecordedRobot):
         return self
 
     def doubts(self, outputs: Mapping[str, PyTree]) -> list[str]:
-        """Return sentences on positions of a log that the model cannot have; default: none."""
+        """Return sentences on recorded positions that are impossible in the model; default: none."""
         return []
 
     def identifiable(self, max_delay_s: float) -> IdentifiableRecording:

@@ -18,29 +18,29 @@ if TYPE_CHECKING:
     import jax
 
 SENSOR, AGENT, ACTUATOR, WORLD = "sensor", "agent", "actuator", "world"
-"""Names of the nodes: what measures, what decides (the policy makes its steps), what sends commands to the motors, and
-the robot with its surroundings in simulation."""
+"""Names of the nodes: the sensor, the policy, the node that sends commands to the motors, and the simulated robot."""
 ROLES = {"sensor": SENSOR, "supervisor": AGENT, "actuator": ACTUATOR, "world": WORLD}
-"""Role -> node, as the metadata of a log has it."""
+"""Role -> node, as in the metadata of a log."""
 BURST = 3
-"""Extra messages in the world's window of commands. After a hiccup, the actuator makes its missed steps one right after
-the other, so that commands come faster than its rate for a moment."""
+"""Extra messages in the world's window of commands: after a hiccup, the actuator makes up for missed steps, so that
+commands come faster than its rate for a moment.
+"""
 DELAYS = ("sensor_delay", "actuator_delay")
 """Names of the two delays: from the world to the sensor, and from the actuator to the world."""
 Draw = Callable[["jax.Array"], dict[str, PyTree]]
-"""Draws dynamics and delays of an episode: key -> values by name."""
+"""Draws the parameters of an episode: key -> values by name."""
 DELAY_SPREAD_S = 0.002
-"""Largest deviation, up or down, of an episode's delay from that of the simulated loop [s]."""
+"""Largest deviation, up or down, of an episode's delay from the nominal one [s]."""
 EMPTY: Mapping[str, np.ndarray] = MappingProxyType({})
-"""No samples."""
+"""No samples of parameters."""
 
 
 def delay_parameters(max_delay_s: float) -> list[Parameter]:
     """Return the delays as parameters: from the world to the sensor, and from the actuator to the world.
 
-    A log determines their sum alone: with one longer and the other shorter by as much, and a world that is as much
-    earlier, every message stays the same. So the first is a constant, and the second, up to twice ``max_delay_s``, is
-    identified: it is the sum.
+    A log determines only their sum: if one is longer, the other shorter, and the world earlier by the same time, every
+    message stays the same. So the first is fixed, and the second, up to twice ``max_delay_s``, is identified as the
+    sum.
 
     Args:
         max_delay_s: Upper bound of the sensor's delay [s].
@@ -67,7 +67,7 @@ def delay_bounds(
         tick_s: The world's period [s], over which the sensor interpolates.
         spread_s: Largest deviation of an episode's delay from its value [s].
         lead_s: Time that the world adds to the actuator's delay [s]; see ``ServoWorld.init_delays``.
-        draws: Samples that episodes use in place of the values, each of shape ``(K,)`` [s].
+        draws: Samples that episodes use instead of the values, each of shape ``(K,)`` [s].
 
     Returns:
         Name -> (value, min, max) [s].
@@ -81,10 +81,10 @@ def delay_bounds(
 
 
 def split_delay(values: Mapping[str, float], tick_s: float, spread_s: float = DELAY_SPREAD_S) -> dict[str, float]:
-    """Return parameters with part of the actuator's delay moved to the sensor, as far as a simulated loop needs it.
+    """Return parameters with part of the actuator's delay moved to the sensor, as a simulated loop needs.
 
     The simulated sensor interpolates between ticks of the world, so its delay must be at least one tick: the next tick
-    is not simulated yet. Only the sum of both delays affects a policy's observations of its commands.
+    is not simulated yet. A policy notices only the sum of both delays.
 
     Args:
         values: Parameters by name, with both delays [s] or neither.
@@ -101,12 +101,12 @@ def split_delay(values: Mapping[str, float], tick_s: float, spread_s: float = DE
 def split_drawn_delay(
     values: Mapping[str, float], draws: Mapping[str, np.ndarray], tick_s: float, spread_s: float
 ) -> dict[str, np.ndarray]:
-    """Return samples of parameters with the sensor's delay as ``split_delay`` has it, as far as the sum of both allows.
+    """Return samples of parameters with the sensor's delay of ``split_delay``, or the whole sum if that is shorter.
 
-    The variation of the sum is then in the actuator's delay: only the sum affects a policy.
+    The rest of the sum, and so its variation, is the actuator's delay.
 
     Args:
-        values: Parameters by name, with both delays [s] or neither; a delay that is not drawn is as here.
+        values: Parameters by name, with both delays [s] or neither; used for a delay without samples.
         draws: Samples of some parameters, each of shape ``(K,)``, delays in [s].
         tick_s: The world's period [s].
         spread_s: Largest deviation of an episode's delay from its value [s].
@@ -121,11 +121,10 @@ def split_drawn_delay(
 def control_nodes(sensor: BaseNode, agent: BaseNode, actuator: BaseNode) -> dict[str, BaseNode]:
     """Connect sensor, agent and actuator, on hardware as in simulation.
 
-    Agent and actuator have blocking inputs and ``Scheduling.PHASE``: after a hiccup they make the steps that they
-    missed one right after the other and return to their grid. With ``FREQUENCY``, a single step of 100 ms would delay
-    their schedules for good, and all later actions would use data that are 80 ms old while newer messages wait. The
-    sensor has no blocking input and keeps ``FREQUENCY``, so its samples are never old nor closer together than its
-    period. Without overruns the two options are the same.
+    Agent and actuator have blocking inputs and ``Scheduling.PHASE``: after a hiccup they make the missed steps without
+    pauses and return to their grid. With ``FREQUENCY``, a single step of 100 ms would delay their schedules for good,
+    and all later actions would use data that are 80 ms old while newer messages wait. The sensor has no blocking input
+    and keeps ``FREQUENCY``, so its samples are never old nor closer together than its period.
 
     Returns:
         The three nodes by name.
@@ -155,7 +154,7 @@ def simulated_loop(
     to_world = TrainableDist.create(*delays[DELAYS[1]], "zoh_mean", BURST) if delays else None
     from_world = TrainableDist.create(*delays[DELAYS[0]], "linear") if delays else None
     world.connect(actuator, skip=True, delay_dist=to_world)
-    # skip=True: the delay must not shift the sensor's phase, as a real sensor does not wait for the world either.
+    # skip=True, so that the delay does not shift the sensor's phase: a real sensor does not wait for the world, either.
     sensor.connect(world, skip=True, delay_dist=from_world)
     return {**nodes, world.name: world}
 
@@ -166,7 +165,7 @@ def recorded_loop(
     """Connect the nodes that identification simulates: recorded commands drive the world, the sensor measures it.
 
     Args:
-        max_delay_s: Upper bound of the sensor's delay, and half of that of the actuator's [s].
+        max_delay_s: Upper bound of the sensor's delay [s]; the actuator's is twice as large.
         ahead_s: How much later than recorded the sensor's steps are simulated [s].
         lead_s: Time that the world adds to the actuator's delay [s].
 

@@ -37,11 +37,12 @@ class Goals(Base):
 
 @pytree.dataclass
 class Decision(Base):
-    """The agent's message: what the motors shall do, and the aim of the task.
+    """The agent's message: the command, and the aim of the task.
 
     Attributes:
         command: Shape ``(actions,)``: the command, such as goal positions [rad].
-        aim: Shape ``(k,)``: the task's aim at this time, e.g. a target's position ``(3,)`` [m]; None: it has none.
+        aim: Shape ``(k,)``: the task's aim at this time, e.g. a target's position ``(3,)`` [m]; None: the task has
+            none.
     """
 
     command: Array
@@ -56,7 +57,7 @@ class EpisodeStart(Base):
         position: Shape ``(channels,)``: positions of the joints [rad].
         velocity: Shape ``(channels,)`` [rad/s].
         aim: Shape ``(k,)``: the task's aim, e.g. a target's position ``(3,)`` [m].
-        command: Shape ``(actions,)``: the command before the first step; None: the positions are.
+        command: Shape ``(actions,)``: the command before the first step; None: the positions.
     """
 
     position: Array

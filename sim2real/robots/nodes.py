@@ -1,4 +1,4 @@
-"""The nodes of a robot's loop: sensor and actuator in simulation; and on hardware, with the robot's connection.
+"""The nodes of a robot's loop: sensor and actuator in simulation and on hardware, and the robot's connection.
 
 Imports no MuJoCo, which would take seconds.
 """
@@ -46,7 +46,7 @@ class NoiseSizes(NamedTuple):
 
 @pytree.dataclass
 class SensorBias(Base):
-    """The constant error of a simulated sensor's readings in an episode.
+    """The constant errors of a simulated sensor's readings in an episode.
 
     Attributes:
         bias: Shape ``(noise,)``, each in the unit of its noise.
@@ -56,10 +56,10 @@ class SensorBias(Base):
 
 
 class SimSensor(BaseNode):
-    """The encoders in simulation: passes on the world's message, with the delay in ``DelayParams``.
+    """The encoders in simulation: passes on the world's message, after the delay in ``DelayParams``.
 
     Attributes:
-        noise: Noise of the readings; empty: they are exact.
+        noise: Noise of the readings; empty: none.
     """
 
     def __init__(self, name: str, rate: float, world: BaseNode, **options: Unpack[NodeOptions]) -> None:
@@ -105,7 +105,7 @@ class SimSensor(BaseNode):
     def _noisy(self, message: PyTree, step_state: StepState, sizes: NoiseSizes) -> PyTree:
         if step_state.rng is None:
             raise UsageError(f"sensor {self.name!r} has noise and no random numbers to draw it from")
-        # A key of its own for each step; the sensor has no other use for its random numbers.
+        # Each step derives another key; the sensor uses its key for nothing else.
         key = jax.random.fold_in(step_state.rng, step_state.seq)
         added = jax.random.normal(key, (len(self.noise),)) * sizes.deviation
         added = _noise_factor(step_state.params) * added + step_state.state.bias
@@ -127,7 +127,8 @@ def _noise_factor(params: PyTree) -> PyTree:
 class SimActuator(BaseNode):
     """The bus in simulation: passes on the agent's commands.
 
-    The default output is ``start`` of the agent's parameters, at which the joints are held, or zeros if they have none.
+    The default output, which holds the joints before the first command, is ``start`` of the agent's parameters, or
+    zeros.
 
     Args:
         message: Makes the node's message from a command ``(joints,)``.
@@ -193,9 +194,9 @@ class ServoActuator(BaseNode):
     """Sends the agent's commands through the safety gate; its output is the command that was sent.
 
     Args:
-        message: Makes the node's message from a command ``(motors,)``. If the device's commands have columns, it has a
-            field of the shape ``(motors,)`` for each, by the column's name.
-        begin: Called after the torque is on: brings the robot to the start of the task.
+        message: Makes the node's message from a command ``(motors,)``. If the device's commands have columns, the
+            message has a field ``(motors,)`` for each column, with its name.
+        begin: Brings the robot to the start of the task; called after the torque is on.
     """
 
     jittable = False
@@ -230,7 +231,7 @@ class ServoActuator(BaseNode):
         """Send the newest command.
 
         Raises:
-            SafetyStop: The newest measurement is too old, or what the gate stopped.
+            SafetyStop: The newest measurement is too old, or the gate stopped the robot.
         """
         self._rig.require_fresh()
         message = step_state.inputs[AGENT]
@@ -240,7 +241,7 @@ class ServoActuator(BaseNode):
         names = [column.name for column in self._rig.device.commanded.columns]
         if not names:
             return step_state, self._message(self._rig.command(wanted, age_s, now_s))
-        # With columns, the message is made first, and its fields are sent.
+        # With columns, make the message first, and send its fields.
         sent = self._message(wanted)
         table = np.stack([np.asarray(getattr(sent, name), np.float64) for name in names], axis=-1)
         allowed = self._rig.command(table, age_s, now_s)
@@ -251,7 +252,7 @@ class Excitation(BaseNode):
     """Takes the agent's place during a recording: sends an excitation signal.
 
     Args:
-        signal: Shape ``(N, motors)``: one command a step; after its end the last one again: a goal of 0 may be a leap.
+        signal: Shape ``(N, motors)``: one command for each step; after its end, the last command is repeated.
 
     Raises:
         UsageError: The signal is not finite.
@@ -275,10 +276,8 @@ class Excitation(BaseNode):
 class PolicyNode(BaseNode):
     """The agent's node on the wall clock; it calls the bundle's runner instead of a policy in JAX.
 
-    The agent makes observations and messages, from numpy arrays; its own ``step`` is not called.
-
     Args:
-        agent: The agent's node; it is left unconnected.
+        agent: A ``PolicyAgent`` that is not connected: it makes observations and messages from numpy arrays.
     """
 
     jittable = False
@@ -311,37 +310,37 @@ class PolicyNode(BaseNode):
 
 
 def in_numpy(tree: PyTree) -> PyTree:
-    """Return a pytree with numpy arrays for leaves: an array of JAX turns every later computation into one of JAX."""
+    """Return a pytree with numpy arrays as leaves: one array of JAX would make all later computations use JAX."""
     return pytree.map(np.asarray, tree)
 
 
 # -- the robot on hardware, and its graph
 
 _HOLD_S, _HANG_S = 1.0, 20.0
-"""How long an excitation's last goals are repeated; longest time for joints to come to rest before it [s]."""
+"""Time for which an excitation's last goals are repeated; longest wait for joints at rest before it [s]."""
 _STILL_RAD_S = 0.3
 """Speed below which a joint is at rest, above the noise of motors' speeds [rad/s]."""
 HOME_RAD_S = 1.0
-"""Speed of joints on the way to the first goals of an excitation, or to the rest pose."""
+"""Speed of joints on the way to the first goals of an excitation, or to the rest pose [rad/s]."""
 
 
 @contextmanager
 def connected(
     drive: RobotDrive, port: str, limits: GateLimits, truth_path: Path, seed: int, hanging: bool = False
 ) -> Iterator[Rig]:
-    """Open a robot for the block, with torque off; at its end the torque is off and the port is closed.
+    """Open a robot for the block, with torque off; afterwards the torque is off and the port is closed.
 
     Args:
         port: Device file of the port, or ``embedded`` for the emulated robot.
         truth_path: File for the emulated robot's true states and latencies.
         seed: Seed of the emulated robot's jitter and faults.
-        hanging: Whether a robot on legs hangs in a stand, to be recorded.
+        hanging: Whether the emulated legs hang in a stand, for a recording.
 
     Raises:
-        UsageError: The port is ``embedded``, but the robot has none.
+        UsageError: The port is ``embedded``, but the robot has no emulator.
         HardwareLost: The device cannot be opened, or a motor does not answer.
     """
-    # Imported here: training also makes robots, and must not import their drivers.
+    # Imported late: training also makes robots, and must not import drivers.
     from sim2real.hardware.safety.rig import Rig
 
     with ExitStack() as stack:
@@ -351,7 +350,7 @@ def connected(
                 raise UsageError("this robot has no embedded twin", hint="name its port with --port")
             robot = stack.enter_context(embedded.start(truth_path, seed, drive.mounting))
             port = robot.port
-            # Wait until the last command, torque off, has taken effect, so that it is in the truth file.
+            # Wait until the last command, "torque off", has taken effect, so that the truth file has it.
             config = embedded.emulator
             stack.callback(robot.sleep, config.actuation_latency_s + config.actuation_jitter_s + 0.01)
         device = drive.device(port, limits.servo_watchdog_s, is_embedded)
@@ -361,11 +360,10 @@ def connected(
 def recording_nodes(robot: Robot, rig: Rig, signal: np.ndarray | None, standing: bool = False) -> dict[str, BaseNode]:
     """Return the graph on hardware that plays an excitation ``(N,)`` or ``(N, actions)``, one row a step.
 
-    Goals of joints begin where the joints are. Without an excitation the graph only measures: it has the sensor alone,
-    and no node sends a command.
+    Goals begin at the joints' positions. Without an excitation, the graph has only the sensor, and sends no command.
 
     Args:
-        standing: Whether it begins as the task does, such as by standing up.
+        standing: Whether the recording begins like the task, such as by standing up.
     """
     if signal is None:
         return {SENSOR: _sensor(robot, rig)}
@@ -380,7 +378,7 @@ def recording_nodes(robot: Robot, rig: Rig, signal: np.ndarray | None, standing:
 def deployment_nodes(
     robot: Robot, rig: Rig, policy: Runner, trial: int = 0
 ) -> tuple[dict[str, BaseNode], dict[str, PyTree]]:
-    """Return the graph on hardware that runs a policy, and the agent's parameters: it starts where the robot is.
+    """Return the graph on hardware that runs a policy, and the agent's parameters, which start at the robot's pose.
 
     Args:
         policy: ``reset()`` begins an episode; a call with an observation ``(O,)`` returns the action ``(A,)``.
@@ -393,8 +391,8 @@ def deployment_nodes(
 
 
 def approached(goals: np.ndarray, position_rad: np.ndarray, rate_hz: float) -> np.ndarray:
-    """Return goals ``(N, joints)`` that begin at positions ``(joints,)`` and reach the given goals at 1 rad/s [rad]."""
-    # Repeat the last goals: joints that began farther away than the excitation lasts go on towards them.
+    """Return goals ``(N, joints)`` [rad] that begin at ``position_rad (joints,)`` and approach ``goals`` at 1 rad/s."""
+    # Repeat the last goals: joints that began far away may still be on the way to them.
     goals = np.vstack([goals, np.repeat(goals[-1:], round(_HOLD_S * rate_hz), axis=0)])
     offset = position_rad - goals[0]
     covered = np.arange(len(goals))[:, None] * HOME_RAD_S / rate_hz

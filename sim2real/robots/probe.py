@@ -1,4 +1,4 @@
-"""The delay between a command and the motion that answers it, from a few small steps on the robot."""
+"""Measures the delay between a command and the motion that answers it, by a few small steps on the robot."""
 
 from __future__ import annotations
 
@@ -17,17 +17,18 @@ if TYPE_CHECKING:
     from sim2real.hardware.safety.rig import Rig
 
 _PERIOD_S, _WATCHED_S = 0.004, 0.16
-"""Time between two samples; duration of the measurement of a step."""
+"""Time between two samples; how long the answer to a step is measured [s]."""
 _BUSY_S, _TRIES, _FEWEST = 0.012, 5, 4
-"""A step with a longer pause than this between two samples is repeated. Largest number of steps, as a multiple of the
-configured one; least number of undisturbed steps."""
+"""A step with a longer pause between two samples is repeated [s]. Most steps, as a multiple of ``_STEPS``; fewest
+undisturbed steps.
+"""
 _RISE_RAD = 0.05
-"""The answer is fitted up to this angle; beyond it, weight and friction make it no polynomial."""
+"""The answer is fitted up to this angle [rad]: beyond it, a polynomial does not describe weight and friction."""
 _GRID_S = 0.0005
 _TURNS = 10
-"""Turns of the fit; more change the median of the embedded robots' delays by less than a step of the grid."""
+"""Rounds of the fit; more rounds change the median delay of embedded robots by less than a step of the grid."""
 _AGAIN = 5
-"""Samples after which a command is sent again: it must not become stale."""
+"""A command is sent again after this many samples, because it must not become stale."""
 _STILL_RAD_S, _STILL_S, _REST_S = 0.05, 0.1, 3.0
 _JOINT, _STEPS = 0, 8
 """The joint that is stepped, and the number of steps."""
@@ -38,8 +39,8 @@ class StepAnswers:
     """Delays of the answers to some steps.
 
     Attributes:
-        delays_s: From each command's departure to where the fit lets the motion begin, in time stamps of measurements
-            ``(N,)`` [s].
+        delays_s: Shape ``(N,)``: time from each command's departure to the fitted begin of the motion, by time stamps
+            of measurements [s].
         lag_s: See ``Probe``.
     """
 
@@ -54,12 +55,12 @@ class StepAnswers:
 
     @property
     def delay_s(self) -> float:
-        """The middle of these [s]."""
+        """The middle of ``between_s`` [s]."""
         return float(np.mean(self.between_s))
 
     @property
     def jitter_s(self) -> float:
-        """The range of their middle half [s]."""
+        """The range of the middle half of ``delays_s`` [s]."""
         return float(np.subtract(*np.quantile(self.delays_s, [0.75, 0.25])))
 
 
@@ -69,8 +70,8 @@ class Probe:
 
     Attributes:
         step: Size of a step [the command's unit].
-        lag_s: Least and largest time by which an answer seems to begin too late [s], because motion starts softly: at
-            half to twice the robot's friction. A policy is refused only if no time between them explains the answers.
+        lag_s: Smallest and largest time by which an answer seems to begin too late, because motion starts softly [s]:
+            for half to twice the robot's friction. A policy is refused only if no time in between explains the answers.
     """
 
     step: float
@@ -79,13 +80,12 @@ class Probe:
 
 @dataclass
 class Witness:
-    """Makes the steps, and stores measurements and commands: they are a recording, too.
+    """Makes the steps, and stores measurements and commands, which also serve as a recording.
 
     Attributes:
         rig: The robot.
-        measured: Times of the request and of the answer on the device's clock [ns], and the reading, of each
-            measurement.
-        sent: Start and end of sending [ns], and the command after the gate ``(n,)``, of each command.
+        measured: For each measurement: times of request and answer on the device's clock [ns], and the reading.
+        sent: For each command: start and end of sending [ns], and the command after the gate ``(n,)``.
     """
 
     rig: Rig
@@ -129,9 +129,9 @@ def measure_delay(witness: Witness, probe: Probe) -> StepAnswers:
 def delays_of(answers: Sequence[np.ndarray]) -> StepAnswers:
     """Return the start of each answer.
 
-    An answer is 0 until the delay is over, and then a square and a cube, the same for all, times a factor of its own:
-    weight and friction differ with the angle at which the joint came to rest. The curve, and delay and factor of each
-    answer, are fitted in turn, from the delay that fits all best.
+    An answer is 0 until the delay is over; then it is a curve ``a t^2 + b t^3``, common to all answers, times a factor
+    of each answer, as weight and friction depend on the angle. Curve, delays and factors are fitted in turn, starting
+    from the delay that fits all answers best.
 
     Args:
         answers: Each of shape ``(N, 2)``: time since the command [s], and motion since then in its direction [rad].
@@ -142,9 +142,9 @@ def delays_of(answers: Sequence[np.ndarray]) -> StepAnswers:
             hint="is it blocked, or its supply off? without this check: --no-measure-delay",
         )
     end_s = float(np.median([a[np.argmax(a[:, 1] >= _RISE_RAD), 0] for a in answers if a[:, 1].max() >= _RISE_RAD]))
-    # A fast joint is there within a few samples: the answer began in the first of them.
+    # A fast joint arrives within a few samples: the answer began in the first of them.
     grid = np.arange(0.0, max(end_s - 4 * _PERIOD_S, _PERIOD_S), _GRID_S)
-    # The same samples for every delay: otherwise no samples fit best.
+    # Compare all delays on the same samples: otherwise a delay without samples would fit best.
     answers = [a[: max(2, int(np.sum(a[:, 0] <= end_s)))] for a in answers]
     samples = np.concatenate(answers)
     residual = [np.linalg.lstsq(_powers(samples[:, 0], d), samples[:, 1], rcond=None)[1].sum() for d in grid]
@@ -158,7 +158,7 @@ def delays_of(answers: Sequence[np.ndarray]) -> StepAnswers:
 
 
 def _answers(witness: Witness, probe: Probe) -> list[np.ndarray]:
-    """Return the answers to some steps; those during which this machine was busy are made again."""
+    """Return the answers to some steps; a step during which this machine was busy is repeated."""
     answers: list[np.ndarray] = []
     for before, goal in itertools.islice(itertools.cycle(_steps(witness.rig, probe)), _TRIES * _STEPS):
         answer = _answer(witness, before, goal)
@@ -175,7 +175,7 @@ def _answers(witness: Witness, probe: Probe) -> list[np.ndarray]:
 
 
 def _steps(rig: Rig, probe: Probe) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return the command before each step, and that of the step: from rest and back, or to both sides of zero."""
+    """Return for each step the commands before and after it: from rest and back, or to both sides of zero."""
     rest, away = rig.gate.fallback, rig.gate.fallback
     away[_JOINT] += probe.step
     if rig.gate.config.stale == "zero":
@@ -219,7 +219,7 @@ def _powers(t_s: np.ndarray, delay_s: float) -> np.ndarray:
 
 
 def _scaled(answer: np.ndarray, delay_s: float, curve: np.ndarray) -> tuple[float, float, float]:
-    """Return the misfit of the curve behind a delay, that delay, and the factor on the curve that fits best."""
+    """Return the misfit of the curve after a delay, the delay, and the best factor on the curve."""
     shape = _powers(answer[:, 0], delay_s) @ curve
     factor = float(shape @ answer[:, 1] / max(shape @ shape, 1e-12))
     return float(np.sum((answer[:, 1] - factor * shape) ** 2)), delay_s, factor

@@ -1,8 +1,8 @@
-"""A robot for the stages, on one page: ``ROBOT = MyRobot()`` in ``pipelines/NAME/robot.py``.
+"""The classes of a robot: ``ROBOT = MyRobot()`` in ``pipelines/NAME/robot.py``.
 
-A robot that was only recorded is a ``RecordedRobot``: what identification needs. A ``Robot`` has three parts besides: a
-drive, a model and a task. Each part inherits its class here; Python
-refuses one without the methods that have no default.
+A robot that was only recorded is a ``RecordedRobot``, which identification needs. A ``Robot`` also has three parts: a
+drive, a model and a task. Each part inherits from a class of this module; Python refuses a part that lacks a method
+without a default.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Embedded:
 
     Attributes:
         plant: Returns its physics: a ``Plant`` of ``sim2real.emulation.plant``, or a ``LeggedBody``.
-        emulator: Latencies and faults; its seed is replaced by that of the stage.
+        emulator: Latencies and faults; the stage sets its seed.
         zero_rad: Reading of an encoder, from count 0, at the device's 0 [rad].
     """
 
@@ -78,18 +78,18 @@ class Embedded:
 
 
 class RobotDrive(ABC):
-    """What is measured of the motors and sent to them, and the device on hardware, whose driver ``device`` imports.
+    """The motors: what is measured and commanded, and the device on hardware, whose driver ``device`` imports.
 
     Attributes:
         rate_hz: Rate of sensor, agent and actuator [Hz].
         channels: The measured quantities of each joint, in the order of the motors.
         at_rest: The sensor's message of a robot at rest.
         noise: Noise of the readings in training without an identification.
-        command: Field of the actuator's message that has the command, one entry for each action.
+        command: Field of the actuator's message with the command, one entry for each action.
         message: Makes the actuator's message from a command ``(actions,)``.
-        units: Field of either message -> its unit.
-        expected_delay_s: Computation delays of sensor, agent and actuator that phases allow for: a bus transaction, and
-            a policy with its thread's wake-up [s].
+        units: Field of the sensor's or actuator's message -> its unit.
+        expected_delay_s: Expected computation delays of sensor, agent and actuator [s]: of a bus transaction, and of a
+            policy with its thread's wake-up.
         centre: Commands around which an excitation moves, ``(actions,)``.
         probe: The steps by which deploy measures the delay; None: the delay is not measured.
     """
@@ -115,19 +115,19 @@ class RobotDrive(ABC):
 
         Args:
             silence_s: Longest silence while torque is on [s].
-            embedded: Whether it is the emulated robot's.
+            embedded: Whether the device is emulated.
         """
 
     @property
     def mounting(self) -> tuple[Joint, ...]:
-        """How each motor's joint is mounted; default: as the device measures and commands it."""
+        """The mounting of each motor's joint; default: angles and commands are the motors'."""
         return ()
 
     def embedded(self, hanging: bool = False) -> Embedded | None:
-        """Return the emulated robot, for the port ``embedded``; default: None, there is none.
+        """Return the emulated robot for the port ``embedded``; default: None, there is none.
 
         Args:
-            hanging: Whether a robot on legs hangs in a stand, to be recorded.
+            hanging: Whether emulated legs hang in a stand, for a recording.
         """
         return None
 
@@ -155,7 +155,7 @@ class RobotDrive(ABC):
 
 
 class Judgement(NamedTuple):
-    """What a task says of the state after a policy step.
+    """A task's judgement of the state after a policy step.
 
     Attributes:
         reward: A number, or terms by name, which are added up.
@@ -174,8 +174,8 @@ class RobotTask(ABC):
     Attributes:
         observation: Terms of the policy's observation, in order.
         action: The policy's actions, in order, with their bounds.
-        limits: Name -> limit that a policy is trained for, such as the ends of the joints' goals.
-        units: Field of the agent's message -> its unit, beside the command.
+        limits: Name -> limit for which a policy is trained, such as the bounds of the joints' goals.
+        units: Further field of the agent's message -> its unit.
     """
 
     observation: tuple[ObservationTerm, ...]
@@ -189,7 +189,7 @@ class RobotTask(ABC):
 
     @abstractmethod
     def random(self, key: Key, draw: Draw) -> tuple[dict[str, PyTree], EpisodeStart]:
-        """Return parameters by name and a start for a random episode of training.
+        """Return parameters by name, and the start, of a random episode of training.
 
         Args:
             draw: Draws dynamics and delays: key -> values by name.
@@ -197,7 +197,7 @@ class RobotTask(ABC):
 
     @abstractmethod
     def at_rest(self, trial: int) -> EpisodeStart:
-        """Return the start at rest of a trial. The same number gives the same aim, on hardware and in simulation."""
+        """Return the start at rest of a trial; a trial's number gives the same aim on hardware and in simulation."""
 
     def moved(self, start: EpisodeStart, position: Array, velocity: Array, share: Scalar = 1.0) -> EpisodeStart:
         """Return a start with an offset of positions ``(channels,)`` [rad] and velocities [rad/s].
@@ -221,8 +221,8 @@ class RobotTask(ABC):
 
         Args:
             t_s: Times ``(N,)`` [s].
-            states: Name -> values ``(N,)``; entries of a vector are named ``name[i]``. They are the measured fields,
-                and the agent's message and ``command``, as sent to the motors, at each step.
+            states: Name -> values ``(N,)``; entries of a vector are named ``name[i]``. The names are the measured
+                fields, the fields of the agent's message, and ``command``, as sent to the motors.
         """
 
 
@@ -260,8 +260,8 @@ class RobotModel(ABC):
     def make_world(self, resumed: bool = False) -> BaseNode:
         """Return the world's node; ``resumed``: episodes begin in the middle of a recording.
 
-        A world with a ``lead_s`` adds that time to the actuator's delay [s]. Its ``true_state`` returns the part of a
-        state that a value function may observe in simulation; without one, it is all of it. Its ``solve_to_rest`` is
+        A world's ``lead_s``, if it has one, is added to the actuator's delay [s]. Its ``true_state`` returns what a
+        value function may observe of the state in simulation; without it, the whole state. Its ``solve_to_rest`` is
         called for a simulation beside a deployment.
         """
 
@@ -270,15 +270,15 @@ class RobotModel(ABC):
         """Return the world's parameters for an episode, from values by name."""
 
     def for_training(self, values: Mapping[str, float], draws: Mapping[str, np.ndarray]) -> RobotModel:
-        """Return the model of a training with values and draws of parameters; default: this one."""
+        """Return the model for a training with values and samples of parameters; default: this model."""
         return self
 
     def exported(self, values: Mapping[str, Scalar]) -> Exported | None:
-        """Return the model with identified values for other simulators; default: None, there is none."""
+        """Return the model with identified values for other simulators; default: None, no export."""
         return None
 
     def following(self, values: Mapping[str, float]) -> Following | None:
-        """Return how joints with identified values follow their commands; None: as the device says."""
+        """Return how joints with identified values follow their commands; None: by the device's `following`."""
         return None
 
 
@@ -286,8 +286,8 @@ class RecordedRobot(ABC):
     """A robot that was recorded: what identification needs.
 
     Attributes:
-        name: Name of its pipeline, which ``load_robot`` sets; of a robot without a folder the name of its class.
-        folder: Folder of its pipeline; None: it has none, and no command finds it by its name.
+        name: Name of its pipeline, which ``load_robot`` sets; without a folder, the name of its class.
+        folder: Folder of its pipeline; None: there is none, and no command finds the robot by its name.
         defaults: Default settings of its stages; None: those of ``sim2real.stages.config.Defaults``.
         units: Field of a message -> its unit.
     """
@@ -310,7 +310,7 @@ class RecordedRobot(ABC):
 
 
 class Robot(RecordedRobot):
-    """A robot that can be recorded, trained for and deployed to. It has three parts, which its ``__init__`` sets."""
+    """A robot that can be recorded, trained and deployed; its ``__init__`` sets its three parts."""
 
     drive: RobotDrive
     task: RobotTask
@@ -351,7 +351,7 @@ PARTS: Mapping[str, type] = {
 
 
 def checked(robot: Any, where: str) -> RecordedRobot:
-    """Return the robot of a module; refuse an incomplete one with all of its gaps.
+    """Return the robot of a module; the error for an incomplete robot lists all gaps.
 
     Args:
         robot: The module's ``ROBOT``; None if it has none.
@@ -382,7 +382,7 @@ def checked(robot: Any, where: str) -> RecordedRobot:
 
 
 def _unset(owner: object, kind: type) -> list[str]:
-    """Return the attributes that a class declares without a default and an object does not have."""
+    """Return the attributes that a class declares without a default, and that an object lacks."""
     return [name for name in kind.__annotations__ if name not in vars(kind) and not hasattr(owner, name)]
 
 
@@ -391,7 +391,7 @@ PAYLOAD = "payload"
 
 
 def watched(robot: RecordedRobot, max_delay_s: float) -> IdentifiableModel:
-    """Return the model to identify with the payload, if it is a term: it may change between deployments."""
+    """Return the model to identify, with the payload if it is a term: it may change between deployments."""
     model = robot.identifiable(max_delay_s)
     if isinstance(robot, Robot) and any(p.term == PAYLOAD for p in model.parameters):
         model.parameters = model.parameters.with_terms([*model.parameters.terms, PAYLOAD])
@@ -437,7 +437,7 @@ GRAVITY = "gravity in the base's axes"
 
 
 def tilt_of(observation: Sequence[ObservationTerm]) -> Callable[[np.ndarray], float] | None:
-    """Return what makes the robot's tilt [rad] of an observation ``(O,)``; None: it has no term ``GRAVITY``."""
+    """Return a function that computes the tilt [rad] from an observation ``(O,)``; None without a term ``GRAVITY``."""
     names = [term.name for term in observation]
     if GRAVITY not in names:
         return None

@@ -36,15 +36,15 @@ _EPISODE_S = 0.2
 
 
 def check_robot(robot: RecordedRobot, folder: Path, limits: GateLimits | None = None) -> None:
-    """Check the parts of a robot that the stages use; of a recorded robot, those that identification uses.
+    """Check the parts of a robot that the stages use; of a recorded robot, the parts that identification uses.
 
     Args:
         folder: Folder for the files of the embedded robot, if there is one.
         limits: Limits of the safety gate; default: those of ``GateLimits``.
 
     Raises:
-        AssertionError: Something does not fit.
-        UsageError: Something is missing or of the wrong kind.
+        AssertionError: A part contradicts another one.
+        UsageError: A part is missing or has the wrong type.
     """
     checked(robot, type(robot).__module__)
     check_identification(robot)
@@ -80,7 +80,7 @@ def check_identification(robot: RecordedRobot, max_delay_s: float = 0.06) -> Non
 
 
 def check_simulation(robot: Robot) -> None:
-    """Check names, shapes and scores by an episode in simulation at the nominal values; it is compiled."""
+    """Check names, shapes and scores in a compiled episode in simulation, at the nominal values."""
     # Parameters and nodes.
     values, size = robot.nominal(), observation_size(robot.task.observation)
     identifiable = {p.name: p for p in robot.identifiable(0.06).parameters}
@@ -117,7 +117,7 @@ def check_simulation(robot: Robot) -> None:
 
 
 def check_embedded(robot: Robot, folder: Path, limits: GateLimits) -> None:
-    """Check that the embedded robot opens, takes torque, and ends without."""
+    """Check that the embedded robot opens, switches torque on, and ends with torque off."""
     truth = folder / "truth.bin"
     with connected(robot.drive, "embedded", limits, truth, 0) as rig:
         reading = rig.measure()
@@ -130,7 +130,7 @@ def check_embedded(robot: Robot, folder: Path, limits: GateLimits) -> None:
 
 
 def _check_start(model: IdentifiableModel, nodes: Mapping[str, Any]) -> None:
-    """Check that parameters at nominal values are of nodes that there are, and finite."""
+    """Check that parameters at nominal values belong to existing nodes, and are finite."""
     values = {p.name: jnp.asarray(p.nominal) for p in model.parameters}
     params = model.params(values, jnp.zeros(2 * len(model.channels)))
     _include(nodes, set(params), "nodes with parameters")

@@ -1,4 +1,4 @@
-"""A robot's loop in simulation: the model to identify, the graph and the task of a training, an episode at rest."""
+"""A robot's loop in simulation: model to identify, graph and task of a training, and an episode from rest."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def _lead_s(world: BaseNode) -> float:
     return getattr(world, "lead_s", 0.0)
 
 
-# -- training, and an episode beside one on the robot
+# -- training, and a simulated episode for comparison with the robot
 
 
 def training_loop(
@@ -81,16 +81,16 @@ def training_loop(
     """Return the graph of a robot in simulation, and the training task.
 
     Args:
-        draws: Samples of some parameters, each of shape ``(K,)``; an episode uses one of the K joint samples in
-            place of the values.
+        draws: Samples of some parameters, each of shape ``(K,)``; an episode uses one of the K joint samples in place
+            of the values.
         computation: Node -> distribution of its computation delay.
         delays: Whether the connections have delays.
-        spread_s: Largest deviation of an episode's delay from that of the values, for which there is room [s].
+        spread_s: Largest deviation of an episode's delay from its value [s]; windows have room for it.
     """
     robot = copy.copy(robot)
     robot.model = robot.model.for_training(values, draws)
     drive, tick_s, world = robot.drive, robot.model.tick_s, robot.model.make_world()
-    # Share the delays between sensor and actuator as a simulated loop needs, and make room for all draws.
+    # Split the delay between sensor and actuator as a simulated loop needs, and make room for all samples.
     draws = split_drawn_delay(values, draws, tick_s, spread_s)
     values = split_delay(values, tick_s, spread_s)
     bounds = delay_bounds(values, tick_s, spread_s, _lead_s(world), draws) if delays else None
@@ -111,15 +111,16 @@ def simulation_params(
     """Return the nodes' parameters for an episode in simulation that starts at rest.
 
     Args:
-        measured: Positions ``(channels,)`` where the robot rested, which may differ from the task's by friction.
+        measured: Positions ``(channels,)`` where the robot rested; friction may hold it off the task's position at
+            rest.
     """
     values, start = split_delay(values, robot.model.tick_s), robot.task.at_rest(trial)
     if measured is not None:
         offset = measured - np.asarray(start.position)
         angles = [robot.drive.units.get(channel.position) == "rad" for channel in robot.drive.channels]
-        # Whole turns of a hinge without range are no offset.
+        # Remove whole turns of a hinge without range.
         offset -= np.where(angles, 2 * np.pi * np.round(offset / (2 * np.pi)), 0.0)
-        # Not `moved`, which keeps drawn starts within the bounds of goals: a robot may rest beyond them, on a stop.
+        # Do not call `moved`, which keeps starts within the bounds of goals: a robot may rest beyond them, on a stop.
         start = start.replace(position=start.position + offset)
     return node_parameters(robot, values, start, policy)
 

@@ -1,4 +1,4 @@
-"""Positions of the joints of a loop that were not recorded, by the model's equalities and the recorded joints."""
+"""Computes unrecorded joint positions of a closed loop from the recorded joints and the model's equalities."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ from sim2real.types import MjModel, PyTree
 mj: Any = mujoco
 
 _PATH, _CORRECTIONS = 32, 8
-"""Steps from the model's start to the recorded angles, and Newton steps there. A loop has several solutions: a path of
-small steps follows the one at the model's start."""
+"""Number of steps from the model's start to the recorded angles, and of Newton steps at the end. A loop has several
+solutions: small steps keep to the solution at the model's start.
+"""
 _DAMPING = 1e-6
-"""Share of the rows' mean square that is added: a planar loop has more rows than it has directions."""
+"""Damping of the least squares, as a share of the rows' mean square: a planar loop has redundant rows."""
 _MOST = 0.3
 """Largest correction of a step [rad or m]."""
 _OTHERS = ("LIMIT", "FRICTIONLOSS", "CONTACT")
@@ -31,13 +32,13 @@ class Closing:
     """Solves the equalities of a model for the joints that were not recorded.
 
     Args:
-        model: The path starts at its first keyframe, or at its zero.
+        model: Model whose first keyframe, or zero, is the start.
         qpos_at: Shape ``(joints,)``: indices of the recorded joints' positions.
         qvel_at: Shape ``(joints,)``: indices of their velocities.
     """
 
     def __init__(self, model: MjModel, qpos_at: np.ndarray, qvel_at: np.ndarray) -> None:
-        # A model with equalities alone.
+        # A model with equalities as its only constraints.
         equalities: Any = copy.copy(model)
         for kind in _OTHERS:
             equalities.opt.disableflags |= int(getattr(mj.mjtDisableBit, f"mjDSBL_{kind}"))
@@ -45,7 +46,7 @@ class Closing:
         self._start = np.array(model.key_qpos[0] if model.nkey else model.qpos0)
         self._qpos_at, self._qvel_at = qpos_at, qvel_at
         self._others = np.setdiff1d(np.arange(model.nv), qvel_at)
-        # Quaternions are turned, other positions are added to.
+        # Steps turn quaternions, and are added to other positions.
         self._turning = [
             (int(model.jnt_qposadr[i]) + 3 * free, int(model.jnt_dofadr[i]) + 3 * free)
             for i in range(model.njnt)
@@ -61,14 +62,14 @@ class Closing:
         """Return positions ``(nq,)`` and velocities ``(nv,)`` with closed loops.
 
         Args:
-            angle: Shape ``(joints,)``: of the recorded joints [rad or m].
-            speed: Shape ``(joints,)``: of the recorded joints [rad/s or m/s].
+            angle: Shape ``(joints,)``: angles of the recorded joints [rad or m].
+            speed: Shape ``(joints,)``: speeds of the recorded joints [rad/s or m/s].
         """
         begin = jnp.asarray(self._start, jnp.result_type(float))
         first = begin[self._qpos_at]
 
         def nearer(carry: tuple[jax.Array, jax.Array], share: jax.Array) -> tuple[tuple[jax.Array, jax.Array], None]:
-            """Go on as in the step before, which passes dead centres, then correct."""
+            """Repeat the motion of the last step, which passes dead centres, then correct."""
             before, rate = carry
             going = share < 1.0
             qpos = (before + going * rate).at[self._qpos_at].set(first + share * (angle - first))
@@ -97,7 +98,7 @@ class Closing:
         return data._impl.efc_pos, data._impl.efc_J
 
     def _solved(self, jacobian: jax.Array, error: jax.Array, most: float = _MOST) -> jax.Array:
-        """Return the smallest motion ``(nv,)`` of the other joints that makes an error, by least squares, in bounds."""
+        """Return the smallest motion ``(nv,)`` of the other joints that changes the equalities by ``error``."""
         passive = jacobian[:, self._others]
         square = passive @ passive.T
         damping = _DAMPING * jnp.trace(square) / max(len(error), 1) + 1e-12

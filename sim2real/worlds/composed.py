@@ -33,8 +33,8 @@ class WorldParams(Base):
 
     Attributes:
         values: Name -> array, in the unit of the attribute that it sets.
-        qpos: Positions ``(nq,)`` that the task's hooks find at the start [m or rad]; None: the model's.
-        qvel: Velocities ``(nv,)`` at the start [m/s or rad/s]; None: none.
+        qpos: Positions ``(nq,)`` at the start, before the task's hooks [m or rad]; None: the model's.
+        qvel: Velocities ``(nv,)`` at the start [m/s or rad/s]; None: 0.
     """
 
     values: dict[str, PyTree]
@@ -56,18 +56,18 @@ class Observations(Base):
 class ComposedWorld(BaseWorld):
     """A task that ticks in MJX as a node: its action comes from one input, its output is the observation.
 
-    A tick is a control step. Delays and intervals of observables pass inside the node, those of connections between
-    nodes. The state is the environment's: data, samples that may still be read, variables of the task. Subclasses may
-    send another message: see ``output``.
+    A tick is a control step. Delays of observables act inside the node, delays of connections between nodes. The state
+    is the environment's: data, samples that may still be read, variables of the task. Subclasses may send another
+    message: see ``output``.
 
     Args:
         field: Field of that input's message: shape ``(nu,)``.
         parameters: Name -> (element or elements, attribute), such as ``{"friction": (joint, "frictionloss")}``.
-        rate: Ticks per second [Hz]; default, and only choice: once a control step.
+        rate: Ticks per second [Hz]; must be the rate of control steps, which is the default.
         **options: Passed on to ``MjxEnvironment``.
 
     Raises:
-        UsageError: When the rate is another, a parameter cannot vary on MJX, or MJX cannot run the world.
+        UsageError: The rate is not that of control steps, a parameter cannot vary on MJX, or MJX cannot run the world.
     """
 
     def __init__(
@@ -94,9 +94,9 @@ class ComposedWorld(BaseWorld):
         self.input_name, self.field = command, field
         self._parameters = dict(parameters or {})
         self._derives = any(attribute in CONSTANTS for _, attribute in self._parameters.values())
-        # Set the parameters once, to refuse those that cannot vary.
+        # Set the parameters once: this refuses parameters that cannot vary.
         physics = self._view()
-        self._set(physics, self.init_params())  # refuses what cannot vary
+        self._set(physics, self.init_params())  # raises an error for parameters that cannot vary
         if self._derives:
             self.environment.carry(constants.derived(self.environment.model, physics.mjx_model))
 
@@ -108,7 +108,7 @@ class ComposedWorld(BaseWorld):
             physics.set(elements, attribute, params.values[name])
 
     def _model(self, params: WorldParams, starts: bool = False) -> mjx.Model:
-        """Return the model with the parameters in it; what follows from masses and lengths is computed at the start."""
+        """Return the model with the parameters; ``starts``: compute constants derived from masses and lengths."""
         physics = self._view()
         self._set(physics, params)
         if starts and self._derives:
@@ -130,7 +130,7 @@ class ComposedWorld(BaseWorld):
         return self.environment.reset(key, self._model(params, starts=True), (qpos, qvel))
 
     def init_delays(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> dict[str, Value]:
-        """Return the delay of commands in an episode [s]: `delay` in the parameters of their sender."""
+        """Return the delay of commands in an episode [s]: ``delay`` in the sender's parameters."""
         del rng
         return delay_of(self.input_name, self.input_name, graph_state)
 
@@ -149,7 +149,7 @@ class ComposedWorld(BaseWorld):
         before = step_state.state
         params = step_state.params
         state: PyTree = self.environment.step(before, action, self._model(params))
-        # An episode that has ended stays ended: readers look only now and then.
+        # An episode that has ended stays ended, because readers do not read every tick.
         truncated = jnp.where(before.done, before.truncated, state.truncated)
         state = state.replace(done=before.done | state.done, truncated=truncated)
         new = step_state.replace(state=state)

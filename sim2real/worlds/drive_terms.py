@@ -1,7 +1,7 @@
-"""What the friction and the drive of a joint add beyond constant coefficients: terms that change from step to step.
+"""Terms of friction and drive that change with a joint's state, and so from step to step.
 
-Dry friction stays MuJoCo's own constraint, so that a joint sticks; only how large it is follows the state. The same
-lines run in MJX and, on arrays of copies, between the steps of C MuJoCo.
+Dry friction stays a constraint of MuJoCo, so that a joint sticks; only its size follows the state. The same code runs
+in MJX and, on arrays of copies, between the steps of C MuJoCo.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 
 
 NO_LIMIT = 1e6
-"""Value of a limit that is absent, in its unit: no robot reaches it."""
+"""Value of an absent limit, in its unit: no robot reaches it."""
 
 _TERMS = (
     *("load", "static", "drag", "bias", "damping_bias", "back_emf", "play", "top_speed"),
     *("cogging_cos", "cogging_sin", "eccentric_cos", "eccentric_sin"),
 )
-"""Terms that take time in each step unless they are absent."""
+"""Terms whose computation is left out if they are absent."""
 
 
 @pytree.dataclass
@@ -36,21 +36,21 @@ class DriveTerms(Base):
     """Coefficients, each of shape ``(joints,)``; with 0 a term adds nothing.
 
     Attributes:
-        load: Dry friction of gears, as a share of the torque that the drive puts through them [1].
-        static: Dry friction at standstill beyond that in motion (Stribeck effect, Tustin's form) [N m].
-        stribeck_rad_s: Speed at which 1/e of it is left [rad/s].
+        load: Dry friction of gears, as a share of the drive's torque [1].
+        static: Additional dry friction at standstill (Stribeck effect, Tustin's form) [N m].
+        stribeck_rad_s: Speed at which 1/e of ``static`` is left [rad/s].
         drag: Friction proportional to the square of the speed [N m s^2/rad^2].
-        bias: By how much dry friction is larger upwards than on average, and smaller downwards [N m].
-        damping_bias: The same of damping [N m s/rad].
-        back_emf: What the motor's voltage takes off its torque per speed, with torque on, beyond its limit [N m s/rad].
-        play: Error of the angle up to which the drive does not push: a servo's dead zone, play of its gears [rad].
-        top_speed: Largest speed at which the drive tries to correct an error, against its damping and the joint's
-            [rad/s].
-        cogging_cos: Torque that pulls the joint back, by the cosine of its angle times ``cogging_per_turn`` [N m].
-        cogging_sin: The same, by the sine [N m].
-        cogging_per_turn: How often that torque repeats in a turn of the joint [1].
-        eccentric_cos: What an encoder off its axis reads beyond the angle, by the angle's cosine [rad].
-        eccentric_sin: The same, by the sine [rad].
+        bias: Dry friction in positive direction minus the mean of both directions [N m].
+        damping_bias: Damping in positive direction minus the mean of both directions [N m s/rad].
+        back_emf: Loss of torque per speed by the motor's back-EMF, with torque on; the limit does not hold for it [N m
+            s/rad].
+        play: Error of the angle below which the drive does not push: dead zone of a servo, play of its gears [rad].
+        top_speed: Largest speed at which the drive corrects an error, against the damping of drive and joint [rad/s].
+        cogging_cos: Amplitude of the cogging torque with the cosine of ``cogging_per_turn`` times the angle [N m].
+        cogging_sin: Amplitude with the sine [N m].
+        cogging_per_turn: Number of periods of cogging in a turn of the joint [1].
+        eccentric_cos: Amplitude of an eccentric encoder's error with the cosine of the angle [rad].
+        eccentric_sin: Amplitude with the sine [rad].
     """
 
     load: Value = 0.0
@@ -69,15 +69,15 @@ class DriveTerms(Base):
     eccentric_sin: Value = 0.0
 
     def read(self, angle: Value) -> Value:
-        """Return what encoders off their axes read at angles [rad], zeros apart."""
+        """Return the readings of eccentric encoders at angles [rad], without their zeros."""
         return angle + self.eccentric_cos * jnp.cos(angle) + self.eccentric_sin * jnp.sin(angle)
 
     def rate(self, angle: Value, speed: Value) -> Value:
-        """Return how fast that changes [rad/s]."""
+        """Return the rate of change of ``read`` [rad/s]."""
         return speed * (1.0 - self.eccentric_cos * jnp.sin(angle) + self.eccentric_sin * jnp.cos(angle))
 
     def angle(self, reading: Value) -> Value:
-        """Return the angles for what encoders read [rad]: three fixed-point iterations, as ``Encoder.angle``."""
+        """Return the angles for readings [rad], by three fixed-point iterations like ``Encoder.angle``."""
         angle = reading
         for _ in range(3):
             angle = reading - (self.read(angle) - angle)
@@ -88,8 +88,8 @@ class DriveLaw:
     """Sets damping and dry friction of a ``DrivenWorld``'s joints before every step.
 
     Args:
-        qpos_at: Shape ``(joints,)``: where the joints' positions are.
-        qvel_at: Shape ``(joints,)``: where their velocities are.
+        qpos_at: Shape ``(joints,)``: indices of the joints' positions.
+        qvel_at: Shape ``(joints,)``: indices of their velocities.
         others: Indices of the velocities of joints without a drive; ``qvel_at`` and ``others`` cover the model.
     """
 
@@ -104,7 +104,7 @@ class DriveLaw:
         self._absent: frozenset[str] = frozenset()
 
     def among(self, values: Mapping[str, np.ndarray]) -> DriveLaw:
-        """Return the law without the terms that no copy has: in numpy they take as long as a step in C."""
+        """Return the law without terms that no copy has: in numpy they would take as long as a step in C."""
         law = copy.copy(self)
         law._absent = frozenset(name for name in _TERMS if not np.any(values[name]))
         if np.all(values["top_speed"] >= NO_LIMIT):
@@ -114,7 +114,7 @@ class DriveLaw:
     def steady(
         self, values: Mapping[str, np.ndarray], control: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]] | None:
-        """Return the controls of all steps, the applied forces, and damping and friction; None if a term follows."""
+        """Return controls of all steps, applied forces, damping and friction; None if a term depends on the state."""
         law, count = self.among(values), len(self._qvel_at)
         same = {"bias"}
         on = control[..., 3 * count : 4 * count]
@@ -145,7 +145,7 @@ class DriveLaw:
         braked = on * v["back_emf"] if self._has("back_emf") else 0.0
         if self._has("eccentric_cos", "eccentric_sin", "play", "top_speed"):
             force = self._force(xp, v, (force, kp, kd, goal), angle, braked)
-        # Damping of each joint; one that differs by direction stays 0 or more: a negative one would drive the joint.
+        # Damping of each joint; where it depends on the direction, at least 0: negative damping would drive the joint.
         damping = v["damping"] + v["damping_bias"] * xp.sign(speed) if self._has("damping_bias") else v["damping"]
         damping, fast = xp.maximum(damping, 0.0) + braked, xp.abs(speed)
         if self._has("drag"):
@@ -157,7 +157,7 @@ class DriveLaw:
         if self._has("load"):
             drive = _within(xp, force - kp * angle - kd * speed, v["limit"]) - braked * speed
             friction = friction + v["load"] * xp.abs(drive)
-        # Friction that differs by direction is a mean friction and a constant torque: it sticks in the same band.
+        # Friction that differs by direction is a mean friction and a constant torque, with the same range of sticking.
         still = 0.0 * speed
         applied = still - v["bias"] if self._has("bias") else still
         if self._has("cogging_cos", "cogging_sin"):
@@ -179,13 +179,13 @@ class DriveLaw:
         return not self._absent.issuperset(names)
 
     def _force(self, xp: Any, v: Mapping[str, Scalar], control: tuple[Array, ...], angle: Array, braked: Scalar) -> Any:
-        """Return the forces with what encoder, dead zone and largest speed change.
+        """Return the forces after the effects of encoder, dead zone and largest speed.
 
         Args:
             control: Forces, stiffnesses, dampings and goals.
-            braked: What the motor's voltage takes off the torque per speed [N m s/rad].
+            braked: Loss of torque per speed by the motor's back-EMF [N m s/rad].
         """
-        # A servo's error is that of its encoder; it does not correct an error within its dead zone.
+        # A servo sees the error of its encoder, and does not correct an error within its dead zone.
         force, kp, kd, goal = control
         off = 0.0
         if self._has("eccentric_cos", "eccentric_sin"):
@@ -194,12 +194,12 @@ class DriveLaw:
         dead = _within(xp, error, v["play"]) if self._has("play") else 0.0
         if not self._has("top_speed"):
             return force - kp * (off + dead)
-        # A push beyond that of the largest speed is cut off: at that speed damping takes all of it.
+        # Limit the push so that damping cancels it at the largest speed.
         top = v["top_speed"]
         push, most = kp * (error - dead), xp.where(top < NO_LIMIT, top * (kd + v["damping"] + braked), xp.inf)
         return force - kp * (off + dead) - push + _within(xp, push, most)
 
 
 def _within(xp: Any, value: Any, most: Any) -> Any:
-    """Return a value between minus and plus a limit; numpy's ``clip`` takes three times as long on few copies."""
+    """Clip a value to plus and minus a limit; numpy's ``clip`` takes three times as long on few copies."""
     return xp.minimum(xp.maximum(value, -most), most)

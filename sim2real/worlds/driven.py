@@ -1,4 +1,4 @@
-"""A MuJoCo model whose joints have drives: what a recorder's commands do to them."""
+"""A MuJoCo model whose joints have drives, which recorded commands move."""
 
 from __future__ import annotations
 
@@ -22,26 +22,26 @@ if TYPE_CHECKING:
 
 
 PAYLOAD = "sim2real_payload"
-"""Body of the payload that a log names."""
+"""Name of the body that is a log's payload."""
 OF_PAYLOAD = {"payload": "kg", "payload_reach": "m"}
-"""Fields of commands that name it, with their units."""
+"""Fields of commands that describe the payload -> units."""
 
 
 @pytree.dataclass
 class DriveCommand(Base):
-    """Command of the drives; each entry has shape ``(joints,)`` or ``(1,)``, and is None where the log has none.
+    """Command of the drives; each entry has shape ``(joints,)`` or ``(1,)``, or is None if the log lacks it.
 
     Attributes:
         goal: Goal position, by the encoder [rad].
         goal_velocity: Goal velocity [rad/s].
         torque: Feed-forward torque; without a goal, the whole torque [N m].
-        duty: The voltage, or a quantity in proportion to it.
+        duty: The voltage, or a quantity proportional to it.
         kp: Stiffness, in the log's unit.
         kd: Damping, in the log's unit.
         enabled: 1 with torque on, 0 with torque off.
         volts: Measured supply voltage [V]; 0: unknown.
-        payload: Mass of what the robot holds, the same in all of a log [kg].
-        payload_reach: Distance of that mass from the origin of its body, towards the body's centre of mass [m].
+        payload: Mass of the payload, constant in a log [kg].
+        payload_reach: Distance of the payload from the origin of its body, towards the body's centre of mass [m].
     """
 
     goal: Value | None = None
@@ -58,19 +58,19 @@ class DriveCommand(Base):
 
 @pytree.dataclass
 class DriveParams(MjxParams):
-    """Parameters of drives, each of shape ``(joints,)``, beside those of the model.
+    """Parameters of drives, each of shape ``(joints,)``, in addition to the model's.
 
-    The force is ``kp * (goal - angle) + kd * (goal_velocity - velocity) + gain * (torque or duty)``, within the limits
-    that the model has for its joints (``jnt_actfrcrange``).
+    The force is ``kp * (goal - angle) + kd * (goal_velocity - velocity) + gain * (torque or duty)``, within the model's
+    limits (``jnt_actfrcrange``).
 
     Attributes:
-        kp: Stiffness [N m/rad], times the log's own where it has one.
-        kd: Damping of the drive [N m s/rad], times the log's own where it has one.
+        kp: Stiffness [N m/rad], or the factor on the log's stiffness.
+        kd: Damping of the drive [N m s/rad], or the factor on the log's damping.
         gain: Torque for each unit of torque or duty.
         released: Share of the drive's damping with torque off, by short-circuited windings.
         zero: Reading of the encoders at the model's zero [rad].
         voltage: Share of stiffness and gain that is proportional to the supply voltage.
-        terms: What friction and drive add to that; None: nothing, which costs nothing.
+        terms: Further terms of friction and drive; None: none.
     """
 
     kp: Value = 0.0
@@ -85,13 +85,13 @@ class DriveParams(MjxParams):
 class DrivenWorld(MjxWorld):
     """A model with a drive on each joint that was recorded.
 
-    A drive is three actuators, as ``sim2real.robots.model.drives.driven`` makes them: a force, a stiffness and a
-    damping, which are its controls. So gains may differ from tick to tick and act at every time step, and damping is
+    A drive consists of three actuators, made by ``sim2real.robots.model.drives.driven``: force, stiffness and damping,
+    whose values are the controls. So gains may change from tick to tick and act at every time step, and damping is
     implicit.
 
     Args:
         rate: Ticks per second [Hz].
-        units: The values of 1 in the log's units of ``kp`` and ``kd``, and the usual supply voltage [V].
+        units: One unit of the log's ``kp`` [N m/rad] and ``kd`` [N m s/rad], and the usual supply voltage [V].
         terms: Whether there are ``DriveTerms``: they are evaluated before every physics step.
         **options: Options of ``MjxWorld``.
     """
@@ -115,7 +115,7 @@ class DrivenWorld(MjxWorld):
         self.lead_s = 0.5 * float(model.opt.timestep)
 
     def init_params(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> DriveParams:
-        """Return the model at its reference, with drives that do nothing."""
+        """Return the model at its reference, with drives of gain 0."""
         params = super().init_params(rng, graph_state)
         zero = jnp.zeros(len(self.joints))
         off = DriveTerms()
@@ -153,7 +153,7 @@ class DrivenWorld(MjxWorld):
         """Return parameters with an initial state; equalities determine the joints that were not recorded.
 
         Args:
-            angle: Shape ``(joints,)``: of the recorded joints, from the model's zero [rad or m].
+            angle: Shape ``(joints,)``: angles angles of the recorded joints, from the model's zero [rad or m].
             speed: Shape ``(joints,)`` [rad/s or m/s].
         """
         if self._closing:
@@ -163,7 +163,7 @@ class DrivenWorld(MjxWorld):
         return params.replace(qpos=qpos, qvel=qvel)
 
     def gaps(self, angles: np.ndarray) -> np.ndarray:
-        """Return the error with which loops close at positions ``(N, joints)``, ``(N,)`` [m or rad]."""
+        """Return the closing error of the model's loops at positions ``(N, joints)``, ``(N,)`` [m or rad]."""
         if not self._closing:
             return np.zeros(len(angles))
         return np.asarray(jax.jit(jax.vmap(self._closing.gap))(jnp.asarray(angles)))
@@ -171,7 +171,7 @@ class DrivenWorld(MjxWorld):
     def init_delays(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> dict[str, Value]:
         """Return the delay of the commands, if the actuator's parameters set one.
 
-        MuJoCo's integrator moves a joint as if a force had acted half a time step earlier: this half step is added.
+        Half a time step is added, because MuJoCo's integrator moves joints as if a force had acted that much earlier.
         """
         del rng
         delays = delay_of(self.input_name, self.input_name, graph_state)
@@ -180,9 +180,9 @@ class DrivenWorld(MjxWorld):
     def _control(self, step_state: StepState) -> jax.Array:
         """Return forces, stiffnesses and dampings, ``(3 * joints,)``, for the newest command.
 
-        With terms, ``(5 * joints,)``: then 1 with torque on or 0 with torque off, and the goals.
+        With terms, ``(5 * joints,)``: followed by 1 (torque on) or 0 (torque off), and the goals.
         """
-        # The gains: the log's, times the parameters.
+        # The gains: the parameters times the log's gains.
         p: DriveParams = step_state.params
         command: DriveCommand = step_state.inputs[self.input_name][-1].data
         still = jnp.zeros(len(self.joints))
@@ -202,7 +202,7 @@ class DrivenWorld(MjxWorld):
 
 
 def _of_log(gain: Value | None, unit: float) -> Value:
-    """Return the log's gain in its unit; 1 without a gain."""
+    """Return the log's gain in SI units; 1 without a gain."""
     return 1.0 if gain is None else gain / unit
 
 

@@ -1,6 +1,6 @@
 """Friction of motors and gears as a sum of terms.
 
-A robot has the terms whose coefficients are numbers; terms whose coefficient is None are absent and cost nothing.
+A term whose coefficient is None is absent and is not computed.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @pytree.dataclass
 class FrictionParams(Base):
-    """Coefficients of friction divided by the joint's inertia; None leaves a term out.
+    """Coefficients of friction, divided by the joint's inertia; None leaves a term out.
 
     Attributes:
         viscous: Friction proportional to the speed [1/s].
@@ -74,17 +74,17 @@ def stopped(velocity: Value, most: Value) -> jax.Array:
 def rubbed(velocity: Value, push: Value, most: Value) -> jax.Array:
     """Return the velocity after a step with dry friction [rad/s].
 
-    Exact for forces that are constant during the step: friction opposes the motion up to the instant at which it
-    stops; from there the joint sticks, or moves the other way for the rest of the step. Were friction to oppose the
-    final motion during the whole step, each reversal would come late by up to a step.
+    Exact for forces that are constant during the step: friction opposes the motion until the joint stops; for the rest
+    of the step the joint sticks, or moves the other way. If friction opposed the final motion during the whole step,
+    each reversal would be late by up to a step.
 
     Args:
-        velocity: Before the step [rad/s].
-        push: What the other forces add in the step [rad/s].
-        most: What friction takes off in the step at most [rad/s].
+        velocity: Velocity before the step [rad/s].
+        push: Change of velocity in the step by the other forces [rad/s].
+        most: Largest change of velocity in the step by friction [rad/s].
     """
     moving = velocity != 0.0
     slowed = velocity + push - jnp.sign(velocity) * most
-    reverses = moving & (jnp.sign(velocity) * slowed < 0.0)  # a product of small speeds is 0
-    rest = jnp.where(reverses, slowed / jnp.where(reverses, slowed - velocity, 1.0), 1.0)  # of the step
+    reverses = moving & (jnp.sign(velocity) * slowed < 0.0)  # compare signs: a product of small speeds would be 0
+    rest = jnp.where(reverses, slowed / jnp.where(reverses, slowed - velocity, 1.0), 1.0)  # share of the step
     return jnp.where(moving & ~reverses, slowed, rest * stopped(push, most))

@@ -39,7 +39,7 @@ class Forces(NamedTuple):
     """The forces on a joint, divided by its inertia.
 
     Attributes:
-        acceleration: All forces but the next two; they should depend little on the velocity [rad/s^2].
+        acceleration: All other forces, which should depend little on the velocity [rad/s^2].
         damping: Coefficient of the forces that are proportional to the velocity and oppose it [1/s].
         dry: Largest dry friction [rad/s^2].
     """
@@ -52,13 +52,13 @@ class Forces(NamedTuple):
 class JointWorld(BaseWorld):
     """Joints integrated by position Verlet, with implicit damping (trapezoidal rule) and exact dry friction.
 
-    The parameters' ``start`` has the initial positions, then the velocities: shape ``(2,)`` for one joint, whose state
-    are numbers, or ``(2 * joints,)``.
+    The parameters' ``start`` has the initial positions, then the velocities: ``(2 * joints,)``, or ``(2,)`` for a
+    single joint, whose position and velocity are scalars.
 
     Forces are evaluated at the middle of a substep. The method is of second order as long as no joint sticks and only
     damping depends on the velocity. With semi-implicit Euler, an identified delay is biased by half a substep.
 
-    If the parameters of the node ``actuator`` have a ``delay``, it is that of its commands.
+    If the parameters of the node ``actuator`` have a ``delay``, commands are delayed by it.
 
     Args:
         rate: Ticks per second [Hz].
@@ -79,7 +79,7 @@ class JointWorld(BaseWorld):
         """Return the command, which is constant during this tick."""
 
     def init_state(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> JointState:
-        """Return the initial positions and velocities that the parameters name."""
+        """Return the initial positions and velocities in the parameters' ``start``."""
         start = ((graph_state or GraphState()).params.get(self.name) or self.init_params(rng)).start
         half = len(start) // 2
         return JointState(start[0], start[1]) if half == 1 else JointState(start[:half], start[half:])
@@ -96,7 +96,7 @@ class JointWorld(BaseWorld):
         return self.output(gs.params.get(self.name) or self.init_params(rng), state)
 
     def init_delays(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> dict[str, Value]:
-        """Return the delay of the commands, where the actuator's parameters set one."""
+        """Return the delay of the commands, if the actuator's parameters set one."""
         del rng
         return delay_of("actuator", "actuator", graph_state)
 

@@ -143,11 +143,13 @@ class MjxWorld(BaseWorld):
     # -- physics that runs elsewhere, see ``worlds.rollouts``
 
     def open_loop(self) -> MjModel:
-        """Take the physics out and return the ``MjModel``; UsageError where a subclass steps in its own way."""
+        """Switch the node's physics off, and return the ``MjModel``; UsageError if a subclass overrides the step."""
         for name in ("step", "init_state", "init_output"):
             if getattr(type(self), name) is not getattr(MjxWorld, name):
                 kind = type(self).__name__
-                raise UsageError(f"world {self.name!r}: {kind}.{name} is its own, and may depend on the state")
+                raise UsageError(
+                    f"world {self.name!r}: {kind}.{name} overrides MjxWorld's, and may depend on the state"
+                )
         self._apart = True
         return self.model
 
@@ -168,12 +170,12 @@ class MjxWorld(BaseWorld):
         return Start(jnp.asarray(params.qpos), jnp.asarray(params.qvel), jnp.zeros(self.model.nv))
 
     def controls(self, step_state: StepState) -> tuple[StepState, jax.Array]:
-        """Return the step state, and the newest control for each physics step, ``(substeps, nu)`` where no law asks."""
+        """Return the step state, and the newest control of each physics step, ``(substeps, nu)`` or a law's input."""
         control = jnp.asarray(self._control(step_state), float)
         return step_state, jnp.broadcast_to(control, (self.substeps, *control.shape))
 
     def message(self, state: PyTree, qpos: jax.Array, qvel: jax.Array, qacc: jax.Array) -> MjxState:
-        """Return what the world sends.
+        """Return the world's message.
 
         Args:
             qpos: Positions ``(nq,)`` [m or rad].

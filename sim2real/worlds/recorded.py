@@ -1,4 +1,4 @@
-"""Nodes in the place of a recorded sender: they do not run, as their outputs are in the log."""
+"""Nodes that stand for recorded senders, and an encoder: senders do not run, as the log has their outputs."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class Encoder(Base):
 
     Attributes:
         offset: Zero offset [rad].
-        eccentricity: Amplitude of the error of the mount: distance of the disc's centre from the axis, divided by the
-            disc's radius [rad].
-        phase: Direction of that displacement [rad].
+        eccentricity: Amplitude of the mount's error [rad]: distance of the disc's centre from the axis, divided by the
+            disc's radius.
+        phase: Direction of the displacement [rad].
     """
 
     offset: Value = 0.0
@@ -53,8 +53,8 @@ class DelayParams(Base):
     """Parameters of a sensor or an actuator, simulated or recorded.
 
     Attributes:
-        delay: Delay of its connection with the world [s]; None: as the connection was made.
-        noise: Factor on deviation and bias of a sensor's noise; None: 1.
+        delay: Delay of its connection with the world [s]; None: the connection's own delay.
+        noise: Factor on standard deviation and bias of a sensor's noise; None: 1.
     """
 
     delay: Scalar | None = None
@@ -62,7 +62,7 @@ class DelayParams(Base):
 
 
 def delay_of(node: str, input_name: str, graph_state: GraphState | None) -> dict[str, PyTree]:
-    """Return what ``init_delays`` returns: input name -> the delay in a node's parameters [s], if they have one."""
+    """Return the result of ``init_delays``: input name -> the delay in a node's parameters [s], if they have one."""
     delay = getattr((graph_state or GraphState()).params.get(node), "delay", None)
     return {} if delay is None else {input_name: delay}
 
@@ -72,7 +72,7 @@ class RecordedActuator(BaseNode):
 
     Args:
         rate: Largest number of commands per second [Hz].
-        message: A command; it is the node's default output.
+        message: A command, which is the node's default output.
     """
 
     def __init__(self, name: str, rate: float, message: PyTree) -> None:
@@ -85,7 +85,7 @@ class RecordedActuator(BaseNode):
         return DelayParams()
 
     def init_output(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> PyTree:
-        """Return the command that the node was made with."""
+        """Return the command that the constructor got."""
         del rng, graph_state
         return pytree.map(lambda leaf: leaf, self._message)
 
@@ -95,7 +95,7 @@ class RecordedSensor(BaseNode):
 
     Args:
         rate: Samples per second [Hz].
-        encoder: The encoder; its parameters may be identified. None: positions are shown as they are.
+        encoder: The encoder, whose parameters may be identified; None: positions are exact.
     """
 
     def __init__(
@@ -114,6 +114,6 @@ class RecordedSensor(BaseNode):
         return self._message(jnp.float32(0.0))
 
     def step(self, step_state: StepState) -> tuple[StepState, PyTree]:
-        """Read."""
+        """Read the world's newest position."""
         position = step_state.inputs["world"][-1].data.position
         return step_state, self._message(step_state.params.read(position) if self._encoder else position)

@@ -1,7 +1,7 @@
-"""Rollouts of many copies of a model on C MuJoCo, on all processors, under controls that are computed beforehand.
+"""Simulates many copies of a model on C MuJoCo, on all processors, under given controls.
 
-A world whose controls do not depend on its state can have its physics here, outside of a graph's program: it then has
-the methods ``open_loop``, ``fields``, ``start``, ``controls`` and ``message``, see ``MjxWorld``.
+The physics of a world whose controls do not depend on its state can run here, outside of the graph's program, if the
+world has the methods ``open_loop``, ``fields``, ``start``, ``controls`` and ``message``; see ``MjxWorld``.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
     from sim2real.types import PyTree, Scalar
 
 _LARGEST_BYTES = 2**26
-"""Most memory for the states of the copies that run at a time."""
+"""Most memory for the states of copies that run at the same time [bytes]."""
 _FRAMES = {
     "body": ("body_ipos", "body_iquat"),
     "geom": ("geom_pos", "geom_quat", "body_ipos", "body_iquat"),
     "site": ("site_pos", "site_quat", "body_ipos", "body_iquat"),
 }
-"""Fields of a position in a body; C ignores them if the position was compiled into the body's frame."""
+"""Fields of positions in a body; C ignores them if the compiled position is the body's frame."""
 _FOLLOWED = frozenset(
     {
         "body_mass",
@@ -46,17 +46,17 @@ _FOLLOWED = frozenset(
         "geom_size",
     }
 )
-"""Fields that MuJoCo derives constants from (``mj_setConst``), among them the inertia of joints whose bodies are
-balanced: C takes it as compiled."""
+"""Fields from which MuJoCo derives constants (``mj_setConst``), among them the inertia of joints with balanced bodies.
+"""
 
 
 class Start(NamedTuple):
-    """Where copies start; leaves ``(..., n)`` with the same leading axes, or 1.
+    """Initial states of copies; leaves ``(..., n)`` with the same leading axes, or 1.
 
     Attributes:
         qpos: Positions ``(..., nq)`` [m or rad].
         qvel: Velocities ``(..., nv)`` [m/s or rad/s].
-        warmstart: Where the solver starts ``(..., nv)`` [m/s^2 or rad/s^2].
+        warmstart: Initial accelerations of the solver ``(..., nv)`` [m/s^2 or rad/s^2].
     """
 
     qpos: Array
@@ -84,9 +84,9 @@ class StepLaw(Protocol):
     def steady(
         self, values: Mapping[str, np.ndarray], control: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]] | None:
-        """Return the controls of all steps, the applied forces and the fields; None if they follow the state.
+        """Return the controls of all steps, the applied forces and the fields; None if they depend on the state.
 
-        Without a call between the steps, C rolls out all of them at once.
+        If they do not, C simulates all steps in one call.
 
         Args:
             control: Shape ``(count, steps, n)``.
@@ -94,26 +94,27 @@ class StepLaw(Protocol):
         return None
 
     def among(self, values: Mapping[str, np.ndarray]) -> StepLaw:
-        """Return the law for these numbers of all copies: a law may skip terms that are off in all of them."""
+        """Return a law without terms that are off in all copies, for speed."""
         return self
 
 
 class WornFriction(StepLaw):
     """Sets dry friction before every step: ``frictionloss * exp(-|velocity| / stribeck_rad_s)`` (Stribeck effect).
 
-    What MuJoCo's constraint holds at standstill stays exact; only how large it is follows the speed.
+    Friction stays a constraint of MuJoCo, which holds joints exactly; only its size follows the speed.
     """
 
     fields: tuple[str, ...] = ("dof_frictionloss",)
-    """Field of the model that it sets, ``(nv,)``."""
+    """Field of the model that the law sets, ``(nv,)``."""
 
     def __call__(
         self, xp: Any, values: Mapping[str, Scalar], control: PyTree, qpos: PyTree, qvel: PyTree
     ) -> tuple[PyTree, PyTree, dict[str, PyTree]]:
-        """Return controls ``(..., nu)`` as they are, forces of 0 ``(..., nv)``, and the friction of the next step.
+        """Return unchanged controls ``(..., nu)``, forces of 0 ``(..., nv)``, and the friction of the next step.
 
         Args:
-            values: ``frictionloss`` at standstill [N m] and ``stribeck_rad_s``, where 1/e of it is left, ``(..., nv)``.
+            values: ``frictionloss`` at standstill [N m] and ``stribeck_rad_s``, at which 1/e of it is left, ``(...,
+                nv)``.
             control: Controls ``(..., nu)``.
             qvel: Velocities ``(..., nv)`` [rad/s].
         """
@@ -123,16 +124,16 @@ class WornFriction(StepLaw):
 
 
 class Rollouts:
-    """Steps copies of a model, each with fields of its own.
+    """Simulates copies of a model, each with its own values of some fields.
 
     Args:
         model: The ``MjModel``; it is copied.
         names: Fields that differ from copy to copy.
-        derives: Whether constants that follow are computed for each copy even if none of ``names`` asks for it.
-        law: Sets controls, forces and fields before every step; unless it is steady, it costs a call of C for each.
+        derives: Whether derived constants are computed for each copy even if none of ``names`` requires it.
+        law: Sets controls, forces and fields before every step; unless it is steady, each step is a call of C.
 
     Raises:
-        UsageError: When C does not look at a field, or only MJX has it.
+        UsageError: C ignores a field, or only MJX has it.
     """
 
     def __init__(
@@ -164,7 +165,7 @@ class Rollouts:
 
         Returns:
             Positions ``(..., 1 + ticks, nq)``, velocities and accelerations ``(..., 1 + ticks, nv)``: at the start, and
-            after each tick. What diverged is NaN.
+            after each tick. A diverged copy is NaN.
         """
         # Find the leading axes that all arguments share.
         ticks = controls.shape[-3]
@@ -216,7 +217,7 @@ class Rollouts:
         flags = batch.expand("opt.disableflags")
         compiled = flags.copy()
         flags |= int(mj.mjtDisableBit.mjDSBL_ACTUATION)
-        views = {n: batch.bind(n) for n in ("qpos", "qvel", "qacc")}  # before: they are filled by the next call
+        views = {n: batch.bind(n) for n in ("qpos", "qvel", "qacc")}  # copy: the next call overwrites the arrays
         failed |= _failing(count, lambda: batch.forward(ids))
         begun = {n: rows[:count].copy() for n, rows in views.items()}
         flags[:] = compiled
@@ -258,7 +259,7 @@ class Rollouts:
         return failed
 
     def _lanes(self, count: int, steps: int) -> int:
-        """Return how many copies run at a time, and make room for them."""
+        """Return how many copies run at the same time, and allocate memory for them."""
         bytes_each = 8 * steps * (self._model.nq + 2 * self._model.nv + self._model.nu)
         lanes = min(count, max(4 * self._threads, _LARGEST_BYTES // max(bytes_each, 1)))
         if self._batch is None or self._batch.nsim < lanes:
@@ -273,7 +274,7 @@ def _value(model: MjModel, name: str) -> np.ndarray:
 
 
 def _failing(count: int, call: Callable[[], object]) -> np.ndarray:
-    """Return which copies MuJoCo raised an error in, ``(count,)``, bool."""
+    """Return in which copies MuJoCo raised an error, ``(count,)``, bool."""
     from mujoco.batch import SimulationError
 
     failed = np.zeros(count, bool)
@@ -285,11 +286,12 @@ def _failing(count: int, call: Callable[[], object]) -> np.ndarray:
 
 
 def _general(model: MjModel, names: tuple[str, ...]) -> MjModel:
-    """Return a copy of a model in which C takes no short cut past the fields that differ, and solves to the end."""
+    """Return a copy of a model in which C uses all fields that differ, with as many iterations as needed."""
     model = copy.copy(model)
-    # What MJX can afford is no limit here: on an arm that was made for one iteration, a hundred cost nothing more.
+    # The few iterations for MJX are no limit here: for an arm with one iteration, a hundred took no longer.
     model.opt.iterations, model.opt.ls_iterations = max(model.opt.iterations, 100), max(model.opt.ls_iterations, 50)
-    if model.ntree == 1:  # all constraints then belong together: an eighth of a step's time went into finding that out
+    # Switch islands off: on models with one island, an eighth of a step's time went into finding it.
+    if model.ntree == 1:
         model.opt.disableflags |= int(mj.mjtDisableBit.mjDSBL_ISLAND)
     for kind, fields in _FRAMES.items():
         if set(fields) & set(names):
@@ -303,7 +305,7 @@ def _general(model: MjModel, names: tuple[str, ...]) -> MjModel:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep MuJoCo from writing of every candidate that diverges, to the terminal and to MUJOCO_LOG.TXT."""
+    """Keep MuJoCo from reporting each diverging candidate, on the terminal and in MUJOCO_LOG.TXT."""
     before = mj.get_mju_user_warning()
     mj.set_mju_user_warning(lambda text: None)
     try:

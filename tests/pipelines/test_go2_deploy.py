@@ -127,7 +127,7 @@ def test_the_load_of_a_robot_on_its_feet(tmp_path, capsys):
     # Without a log in a stand nothing else is known of the joints.
     capsys.readouterr()
     assert cli.main(["identify", "go2", "--log", str(logs[1]), "--runs", str(tmp_path)]) == 1
-    assert "a log of its load is for --standing" in capsys.readouterr().err
+    assert "give a log on its feet as --standing" in capsys.readouterr().err
 
 
 def test_the_gate_has_the_range_of_each_joint():

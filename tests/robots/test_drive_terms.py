@@ -247,7 +247,7 @@ def test_terms_that_few_robots_tell_are_offered_where_they_are_asked_for(model_f
 
 def test_cogging_is_refused_without_how_often_it_repeats(model_file):
     robot = MjcfRobot(RobotConfig(model_file, ("servo",), ("goal",), terms=usual_patterns(("goal",))))
-    with pytest.raises(UsageError, match="number of repeats"):
+    with pytest.raises(UsageError, match="number of its periods"):
         offering(robot, "cogging")
     with pytest.raises(UsageError, match="counted"):
         ParameterPattern("cogging_per_turn")

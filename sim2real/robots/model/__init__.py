@@ -1,1 +1,1 @@
-"""A robot of an MJCF or URDF with a drive on each joint, and recordings."""
+"""A robot described by an MJCF or URDF with a drive on each joint; it was only recorded."""

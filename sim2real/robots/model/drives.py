@@ -1,4 +1,4 @@
-"""A drive on each joint of an MJCF or URDF that was recorded: its actuators, its encoders, a payload, plain MuJoCo."""
+"""Puts a drive on each recorded joint of an MJCF or URDF: actuators, encoders, payload, export to plain MuJoCo."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ mj: Any = mujoco
 
 _LEAST_FRICTION, _LEAST_GRAVCOMP = 1e-9, 1e-9
 _SOFT, _HOLDS = (0.02, 1.0, 0.9, 0.95, 0.001, 0.5, 2.0), 0.9999
-"""MuJoCo's default solref and solimp of friction, and the impedance of friction that holds a joint."""
+"""MuJoCo's default solref and solimp of friction, and an impedance with which friction holds a joint."""
 _OF_SLIDES = {"rad": "m", "rad/s": "m/s", "N m": "N", "N m/rad": "N/m", "N m s/rad": "N s/m", "kg m^2": "kg",
               "N m s^2/rad^2": "N s^2/m^2"}  # fmt: skip
 """Units of hinges -> units of slides."""
@@ -42,7 +42,7 @@ def joints_of(model: MjModel) -> tuple[str, ...]:
 
 
 def slides_of(model: MjModel, joints: Sequence[str]) -> tuple[str, ...]:
-    """Return those of a model's joints that are slides: their units have m for rad, and N for N m."""
+    """Return which of the joints are slides: their units have m instead of rad, and N instead of N m."""
     return tuple(j for j in joints if int(model.joint(j).type[0]) == int(mj.mjtJoint.mjJNT_SLIDE))
 
 
@@ -52,7 +52,7 @@ def ranges_of(model: MjModel, joints: Sequence[str]) -> dict[str, tuple[float, f
 
 
 def unit_for(unit: str, slide: bool) -> str:
-    """Return the unit of a hinge's quantity, or what takes its place at a slide."""
+    """Return the unit of a hinge's quantity, or the matching unit of a slide."""
     return _OF_SLIDES.get(unit, unit) if slide else unit
 
 
@@ -69,18 +69,18 @@ def driven_spec(
 ) -> MjSpec:
     """Return the ``MjSpec`` with a drive on each recorded joint: actuators of force, of stiffness and of damping.
 
-    The actuators of force come first, in the order of the joints, then those of stiffness, whose force is
-    ``-ctrl * angle``, then those of damping, ``-ctrl * velocity``. Their sum stays within the torque limits of the
-    file's own actuators. Joints that were not recorded are held, except joints that move together with recorded ones;
-    see ``holding.plan``. If some move, the keyframe of the held joints is the model's only keyframe.
+    Each joint has three actuators, in the order: force of all joints, stiffness of all joints (force ``-ctrl *
+    angle``), damping of all joints (``-ctrl * velocity``). Their sum stays within the torque limits of the file's
+    actuators. Joints that were not recorded are held, except joints that move together with recorded ones; see
+    ``held.plan``. If some move, the only keyframe of the model has the held positions.
 
     Args:
         step_s: Time step [s].
         fix_base: Whether a floating base is held at its position in the model.
-        rubbing: Whether joints have at least a little dry friction: MJX compiles no friction for a model without any.
+        rubbing: Whether to give joints at least a little dry friction: MJX compiles no friction for a model without it.
         hold: Positions of joints that were not recorded: ``JOINT=VALUE`` [rad or m], or the name of a keyframe.
-        carried: Whether bodies have at least a little gravity compensation: MuJoCo computes none without any.
-        holder: Body that gets a payload without mass, at its centre of mass; "": that of the last joint.
+        carried: Whether to give bodies at least a little gravity compensation: MuJoCo skips it in a model without it.
+        holder: Body that gets a payload of mass 0 at its centre of mass; "": the last joint's body; None: no payload.
     """
     # Hold the joints that were not recorded.
     spec = read_spec(path, contacts)
@@ -118,14 +118,14 @@ def driven_spec(
 
 
 def _clear(part: Any) -> None:
-    """Leave an actuator its gain alone: a new one has bias and limits of the file's default servos."""
+    """Remove bias and limits, which a new actuator takes from the file's default servos."""
     part.biastype, part.dyntype, part.biasprm[:] = mj.mjtBias.mjBIAS_NONE, mj.mjtDyn.mjDYN_NONE, 0.0
     part.gear[:] = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     part.ctrllimited = part.forcelimited = False
 
 
 def stick(spec: MjSpec, joints: Sequence[str], step_s: float) -> None:
-    """Let dry friction hold joints, unless the file has an impedance of its own: at MuJoCo's default they creep.
+    """Let dry friction hold joints, unless the file sets an impedance: at MuJoCo's default, joints creep.
 
     Args:
         step_s: Time step of the simulation [s].
@@ -136,26 +136,26 @@ def stick(spec: MjSpec, joints: Sequence[str], step_s: float) -> None:
 
 
 def copy_back(spec: MjSpec, model: MjModel) -> None:
-    """Copy a compiled model's numbers into its ``MjSpec``, with the gravity compensation, which MuJoCo's own omits."""
+    """Copy a compiled model's numbers into its ``MjSpec``, also the gravity compensation, which MuJoCo omits."""
     spec.copy_back(model)
     for body in spec.bodies[1:]:
         body.gravcomp = float(model.body_gravcomp[body.id])
 
 
 def driven(path: Path, *how: PyTree) -> MjModel:
-    """Return the compiled model of ``driven_spec``, and raise what that raises."""
+    """Return the compiled model of ``driven_spec``."""
     spec = driven_spec(path, *how)
     try:
         return spec.compile()
     except ValueError as error:
         raise UsageError(
             f"{path} does not compile with joints held: {one_line(error)}",
-            hint="remove the elements that need them from the model",
+            hint="remove the elements that need the held joints from the model",
         ) from None
 
 
 def held_in(path: Path, model: MjModel, joints: Sequence[str], fix_base: bool, hold: Sequence[str]) -> Holding:
-    """Return which joints of a file's compiled model are held, as ``driven`` holds them.
+    """Return which joints of a file's compiled model ``driven`` holds.
 
     Args:
         hold: ``JOINT=VALUE`` [rad or m], or the name of a keyframe.
@@ -230,7 +230,7 @@ def gains_of(model: MjModel, joint: str) -> tuple[float, float] | None:
 
 
 def force_of(model: MjModel, joint: str) -> float | None:
-    """Return the force at the joint for a command of 1 to the file's motor, with its gear; None: the joint has none."""
+    """Return the force at the joint for a command of 1 to the file's motor; None: the joint has no motor."""
     for i in _actuators(model, model.joint(joint).id):
         if model.actuator_biastype[i] == int(mj.mjtBias.mjBIAS_NONE):
             return abs(float(model.actuator_gear[i, 0] * model.actuator_gainprm[i, 0]))
@@ -246,10 +246,10 @@ _NO_MASS = 1e-9
 
 
 def add_payload(spec: MjSpec, model: MjModel, joints: Sequence[str], holder: str) -> None:
-    """Add the payload to a model, without mass; its mass and its place are set for each log.
+    """Add a payload of mass 0 to a model; mass and place are set for each log.
 
     Args:
-        holder: Body that holds it, at its centre of mass; "": that of the last joint.
+        holder: Body that holds it, at its centre of mass; "": the last joint's body.
     """
     names = [model.body(i).name for i in range(1, model.nbody)]
     if holder and holder not in names:
@@ -263,7 +263,7 @@ def add_payload(spec: MjSpec, model: MjModel, joints: Sequence[str], holder: str
         )
     payload = body.add_body(name=PAYLOAD, pos=middle)
     payload.explicitinertial, payload.mass, payload.inertia = True, _NO_MASS, [_NO_MASS] * 3
-    payload.ipos, payload.iquat = [0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]  # not the holder's, as a new body has
+    payload.ipos, payload.iquat = [0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]  # a new body would have the class of its holder
 
 
 def with_payload_of(model: MjModel, sent: Mapping[str, np.ndarray]) -> MjModel:
@@ -318,8 +318,8 @@ class EncoderParams(Base):
 
     Attributes:
         zero: Readings at the model's zero, ``(joints,)`` [rad].
-        terms: The drives' own, which say how far each is off its axis; None: not at all.
-        delay: Of the readings [s]; None: as the connection was made.
+        terms: Terms of the drives, among them the eccentricity of encoders; None: no eccentricity.
+        delay: Delay of the readings [s]; None: the delay of the connection.
     """
 
     zero: Array
@@ -345,7 +345,7 @@ def driven_simulation(
         holder, _, field = name.rpartition(".")
         getattr(model.opt if holder else model, field)[...] = np.asarray(value)
     copy_back(spec, model)
-    for joint, number in zip(how[1], world.joints, strict=True):  # MuJoCo's copy_back omits the limits, too
+    for joint, number in zip(how[1], world.joints, strict=True):  # MuJoCo's copy_back also omits the limits
         spec.joint(joint).actfrcrange = model.jnt_actfrcrange[number]
     mjcf = converged(spec)
     made = mj.MjModel.from_xml_string(mjcf)

@@ -1,4 +1,4 @@
-"""A model file as MuJoCo reads it: ROS packages, and meshes that only contacts need."""
+"""Reads a model file: finds ROS packages, and leaves out missing meshes that only contacts need."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ _PACKAGES: Final = (
 
 
 def read_file(path: Path, contacts: bool) -> tuple[Any, list[str]]:
-    """Return the ``mujoco.MjSpec`` of an MJCF or URDF file, and the omitted files that it names.
+    """Return the ``mujoco.MjSpec`` of an MJCF or URDF file, and the names of omitted meshes and textures.
 
-    A file that cannot be read is omitted where only contacts or pictures need it.
+    Files that only contacts or pictures need are omitted if one of them cannot be read.
 
     Args:
         contacts: Whether bodies touch, so that all meshes are needed.
@@ -60,7 +60,7 @@ def read_file(path: Path, contacts: bool) -> tuple[Any, list[str]]:
 
 
 def one_line(error: Exception) -> str:
-    """Return all lines of an error as one: MuJoCo names the element and its line in the later ones."""
+    """Return the lines of an error as one line: MuJoCo names the element in the later lines."""
     return ", ".join(line.strip().rstrip(",") for line in str(error).splitlines() if line.strip())
 
 
@@ -76,11 +76,11 @@ def read_model(path: Path) -> MjModel:
 
 _PACKAGE = "package://"
 _FROM_GEOMS = 1
-"""Value of the compiler's option inertiafromgeom with which geoms give every inertia."""
+"""Value of the compiler's option inertiafromgeom with which all inertias come from geoms."""
 
 
 def _find_packages(spec: MjSpec, path: Path) -> list[str]:
-    """Replace the names of files in ROS packages by their paths; return the searched places if a file is missing.
+    """Replace ``package://`` names by paths; return the searched places if a file is missing.
 
     Args:
         spec: ``mujoco.MjSpec``; it is changed.
@@ -100,14 +100,14 @@ def _find_packages(spec: MjSpec, path: Path) -> list[str]:
 
 
 def _leave_out(spec: MjSpec) -> list[str]:
-    """Take out files that only contacts and pictures need; return their names.
+    """Remove files that only contacts and pictures need; return their names.
 
-    These are meshes and height fields of bodies whose inertia the file has, or which cannot move, and textures.
+    These are textures, and meshes and height fields of bodies that cannot move or whose inertia the file states.
 
     Args:
         spec: ``mujoco.MjSpec``; it is changed.
     """
-    # Delete geoms that contribute no inertia, and contacts of theirs.
+    # Delete geoms that contribute no inertia, and their contacts.
     gone = [g for g in spec.geoms if (g.meshname or g.hfieldname) and _spare(spec, g.parent)]
     names = {g.name for g in gone if g.name}
     pairs = [p for p in spec.pairs if {p.geomname1, p.geomname2} & names]
@@ -126,7 +126,7 @@ def _leave_out(spec: MjSpec) -> list[str]:
 
 
 def _needed_by(spec: MjSpec) -> list[str]:
-    """Return the bodies whose inertia their meshes give."""
+    """Return the bodies whose inertia comes from meshes."""
     return sorted(
         {g.parent.name or "one without a name" for g in spec.geoms if g.meshname and not _spare(spec, g.parent)}
     )

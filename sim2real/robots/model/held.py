@@ -29,7 +29,7 @@ class Held:
 
     Attributes:
         joint: Its number in the file's model.
-        name: Its name, or that of its body.
+        name: Its name, or the name of its body.
         value: Position: an angle [rad], a length [m], the quaternion of a ball, or empty for a floating base.
         unit: Unit of the value.
         source: Origin of the value.
@@ -44,7 +44,7 @@ class Held:
     passive: bool
 
     def __str__(self) -> str:
-        """Return a line for people."""
+        """Return a line that users read."""
         where = f"at {', '.join(f'{v:.4g}' for v in self.value)}{self.unit and f' {self.unit}'}, " if self.value else ""
         return f"{self.name} {where}{self.source}{'; no actuator of the model drives it' if self.passive else ''}"
 
@@ -81,7 +81,7 @@ def plan(model: MjModel, recorded: Sequence[str], hold: Sequence[str], fix_base:
     moved = _moved(model, couplings, numbers, fix_base)
     key, named = _named(model, hold, numbers, moved, path)
     _refuse_tendons(model, couplings, numbers, {*moved, *named}, path)
-    # Hold every other joint; only joints that carry a free one matter for the dynamics.
+    # Hold all other joints; for the dynamics only the positions of joints that carry a free joint matter.
     held = []
     free = {int(model.jnt_bodyid[i]) for i in numbers | moved.keys()}
     carrying = set().union(*(upwards(model, body) for body in free))
@@ -96,7 +96,7 @@ def plan(model: MjModel, recorded: Sequence[str], hold: Sequence[str], fix_base:
         body = int(model.jnt_bodyid[i])
         matters = body in carrying or bool(upwards(model, body) & free)
         held.append(_held(model, i, named.get(i), key, matters))
-    # Couplings between held joints have no effect any more.
+    # Couplings between held joints have no effect.
     _refuse_outside(model, held, path)
     at = {h.joint for h in held}
     dropped = tuple(c for c in couplings if not c.acts or not c.joints or c.joints <= at)
@@ -149,7 +149,7 @@ def _moved(model: MjModel, couplings: Sequence[Coupling], recorded: set[int], fi
 def _named(
     model: MjModel, hold: Sequence[str], recorded: set[int], moved: Mapping[int, str], path: Path
 ) -> tuple[int, dict[int, float]]:
-    """Return the number of the keyframe, -1 for none, and the named values by joint."""
+    """Return the number of the named keyframe (-1: none), and the named values by joint."""
     # An entry is a keyframe, or JOINT=VALUE.
     keys = [model.key(i).name for i in range(model.nkey)]
     names = {model.joint(i).name: i for i in range(model.njnt)}
@@ -209,12 +209,12 @@ def _refuse_tendons(
             raise UsageError(
                 f"in {path} an actuator of {c.name} moves joint {name!r} together with recorded ones, so it cannot "
                 "be held",
-                hint=f"record it; or, if it was blocked, name where: --hold {name}=VALUE",
+                hint=f"record it; or, if it was blocked, give its position: --hold {name}=VALUE",
             )
 
 
 def _refuse_outside(model: MjModel, held: Sequence[Held], path: Path) -> None:
-    """Refuse joints that would be held outside their ranges: they change the inertia of the others."""
+    """Refuse joints that would be held outside their ranges: wrong positions change the inertia of others."""
     outside = []
     for h in held:
         low, high = model.jnt_range[h.joint]
@@ -225,12 +225,12 @@ def _refuse_outside(model: MjModel, held: Sequence[Held], path: Path) -> None:
         raise UsageError(
             f"{path}: joints that were not recorded would be held outside of their ranges: "
             f"{'; '.join(line for _, line in outside)}",
-            hint=f"{flags} names where each was, in rad or m; a keyframe 'home' of the model does, too",
+            hint=f"{flags} gives the position of each, in rad or m; a keyframe 'home' of the model does, too",
         )
 
 
 def _held(model: MjModel, number: int, named: float | None, key: int, matters: bool) -> Held:
-    """Return where a joint is held; one that no free joint carries, or is carried by, is moved into its range."""
+    """Return where a joint is held; a joint whose position does not matter is moved into its range."""
     # A joint without an actuator is passive.
     kind, name = int(model.jnt_type[number]), model.joint(number).name
     at, low_high = _address(model, number), model.jnt_range[number]
@@ -246,7 +246,7 @@ def _held(model: MjModel, number: int, named: float | None, key: int, matters: b
         value, source = np.array(model.key_qpos[key, at]), f"keyframe {model.key(key).name!r}"
     if kind == _BALL:
         return Held(number, shown, tuple(map(float, value)), "", source, passive)
-    # Move a position that is rounded, or without effect, into the joint's range.
+    # Move a rounded position, or one without effect, into the joint's range.
     unit = "m" if kind == _SLIDE else "rad"
     nearest = np.clip(value, *low_high) if model.jnt_limited[number] else value
     if abs(nearest - value)[0] <= _ROUNDED or not (matters or named is not None):
@@ -261,10 +261,10 @@ def _address(model: MjModel, number: int) -> slice:
 
 
 def _pose(model: MjModel, held: Mapping[int, Held], joints: Mapping[int, Any]) -> None:
-    """Give bodies the poses that they have with held joints at their values, and their free joints the axes.
+    """Set the poses of bodies for the held joints' values, and anchors and axes of their free joints.
 
-    Other joints are at their references, where they move nothing. Anchors and axes of free joints are those of that
-    moment, in the frame of the body: a held joint that follows turns them.
+    Free joints are at their references, where they do not move a body. Their anchors and axes are transformed into the
+    frame of the body, which held joints behind them turn.
     """
     data = mj.MjData(model)
     for number, h in held.items():
@@ -288,7 +288,7 @@ def _pose(model: MjModel, held: Mapping[int, Held], joints: Mapping[int, Any]) -
             joints[number].axis = turn.T @ data.xaxis[number]
 
 
-# -- joints that move together: in loops, by equalities, which URDF's mimic becomes, and by tendons
+# -- joints that move together: in loops, by equalities (URDF's mimic becomes one), and by tendons
 
 
 @dataclass(frozen=True)
@@ -300,7 +300,7 @@ class Coupling:
         joints: Numbers of the joints.
         equality: Number of the equality; -1: it is a tendon.
         tendon: Number of the tendon; -1: it is an equality.
-        acts: Whether the coupling exerts a force of its own; a tendon that only an actuator pulls does not.
+        acts: Whether the coupling exerts a force without an actuator; a tendon that only an actuator pulls does not.
     """
 
     name: str
@@ -325,7 +325,7 @@ def couplings_of(model: MjModel) -> list[Coupling]:
 
 
 def groups(couplings: Iterable[Coupling]) -> list[frozenset[int]]:
-    """Return the sets of joints that couplings which act join, directly or through other joints."""
+    """Return the sets of joints that acting couplings connect, directly or through other joints."""
     merged: list[frozenset[int]] = []
     for coupling in couplings:
         if coupling.acts and coupling.joints:
@@ -355,7 +355,7 @@ def joints_of_tendon(model: MjModel, tendon: int) -> frozenset[int]:
 
 
 def below(model: MjModel, joint: int) -> set[int]:
-    """Return the numbers of the joints of a joint's body and of the bodies that hang on it."""
+    """Return the numbers of the joints of a joint's body and of all bodies below it."""
     top = int(model.jnt_bodyid[joint])
     return {i for i in range(model.njnt) if top in upwards(model, int(model.jnt_bodyid[i]))}
 
@@ -390,7 +390,7 @@ def _between(model: MjModel, bodies: Sequence[int]) -> set[int]:
 
 
 def upwards(model: MjModel, body: int) -> set[int]:
-    """Return a body and its ancestors without the world."""
+    """Return a body and its ancestors, except the world."""
     bodies: set[int] = set()
     while body > 0:
         bodies.add(body)

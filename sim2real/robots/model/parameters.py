@@ -1,4 +1,4 @@
-"""The quantities of an MJCF with drives that can be identified, as one table, and the parameters that patterns name."""
+"""Identifiable quantities of an MJCF with drives, as one table, and the parameters that patterns select."""
 
 from __future__ import annotations
 
@@ -19,27 +19,29 @@ from sim2real.worlds.driven import PAYLOAD
 
 ALL = ".*"
 ALIKE = 0.3
-"""Deviation of the prior of factors between joints, about 1: joints of one robot are alike where data says no other."""
+"""Standard deviation of the prior of factors between joints, around 1: joints of a robot are alike unless data shows
+more.
+"""
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """A quantity of a model with drives.
+    """A quantity of a model with drives; a row of the table ``QUANTITIES``.
 
     Attributes:
-        unit: At a hinge; a slide has m for rad, and N for N m.
-        about: What it is.
+        unit: Unit for a hinge; for a slide, m replaces rad and N replaces N m.
+        about: Description.
         excite: Motion that determines it.
-        low, high: Bounds; with ``scale``, see there.
+        low, high: Bounds; see ``scale``.
         place: Where a value belongs: ``drive`` (a field of ``DriveParams``), ``law`` (a field of ``DriveTerms``), a
-            field of the model per degree of freedom, or a name of its own that ``place`` knows.
+            field of the model per degree of freedom, or another name that ``place`` handles.
         term: Optional term of the model; "": none.
-        nominal: Value where the file has none.
-        scale: "": bounds are values; ``factor``: factors below and above the nominal value; another quantity: factors
-            of that one's nominal value.
+        nominal: Value if the file has none.
+        scale: "": bounds are values; ``factor``: bounds are factors of the nominal value; the name of another quantity:
+            bounds are factors of its nominal value.
         vanishes: Whether it may be 0.
-        named: Whether ``auto`` omits its term unless a parameter names it: in few robots these differ from a zero or a
-            stiffness, and damping that differs by direction predicted 1 s of the EMPS best, and 10 s of it worst.
+        named: Whether ``auto`` omits its term unless a parameter names it: most logs cannot tell such terms from a zero
+            or a stiffness, and damping that differs by direction made the EMPS's predictions of 10 s worse.
     """
 
     unit: str
@@ -127,28 +129,29 @@ QUANTITIES: Mapping[str, Quantity] = {
                                  nominal=1.0),
     **{f"{of}_factor": _factor(of) for of in ("kp", "kd", "gain", "damping", "armature")},
 }  # fmt: skip
-"""Name -> quantity. Limits (``torque``, ``top_speed``) are absent at ``NO_LIMIT``; as optional terms they get their
-bounds from the recordings."""
+"""Name -> quantity. A limit (``torque``, ``top_speed``) of ``NO_LIMIT`` is absent; as an optional term it gets its
+bounds from the recordings.
+"""
 LIMITS = ("torque", "top_speed")
 TERMS = {
     q.term: tuple(n for n, other in QUANTITIES.items() if other.term == q.term) for q in QUANTITIES.values() if q.term
 }
-"""Optional terms, and the quantities that each has."""
+"""Optional term -> its quantities."""
 
 
 @dataclass(frozen=True)
 class ParameterPattern:
-    """One quantity of some joints, identified as one value or as one for each.
+    """One quantity of some joints, identified as a common value, or as a value of each joint.
 
     Attributes:
-        what: The quantity; ``payload`` is of a body.
-        joints: Regular expression that a whole name must match.
-        each: Whether each joint has a value of its own.
-        nominal: The value to start from; None: the model's own, or a usual one.
-        low: Lower bound; None: the usual one.
-        high: Upper bound; None: the usual one.
-        name: Name of the parameter; default: the quantity, for a group with the letters of its pattern.
-        free: Whether it is identified; otherwise it is held at ``nominal``.
+        what: Name of the quantity, such as ``damping``; ``payload`` belongs to a body instead of joints.
+        joints: Regular expression that must match a joint's whole name.
+        each: Whether each joint gets its own parameter.
+        nominal: Value to start from; None: the model's value, or that of the table ``QUANTITIES``.
+        low: Lower bound; None: as in the table.
+        high: Upper bound; None: as in the table.
+        name: Name of the parameter; default: the quantity, followed by the letters of ``joints`` for some joints.
+        free: Whether it is identified; otherwise it is fixed at ``nominal``.
         term: Optional term of the model that it belongs to; "": none.
     """
 
@@ -163,7 +166,7 @@ class ParameterPattern:
     term: str = ""
 
     def __post_init__(self) -> None:
-        """Check what can be checked without a model."""
+        """Check what does not depend on a model."""
         if self.what not in QUANTITIES:
             raise UsageError(f"unknown parameter {self.what!r} of a joint. Available: {', '.join(QUANTITIES)}")
         try:
@@ -174,10 +177,10 @@ class ParameterPattern:
         if self.what == "cogging_per_turn" and self.free:
             raise UsageError(
                 "cogging_per_turn is counted, not identified",
-                hint="write cogging_per_turn=N: of a motor the least common multiple of poles and slots, times gears",
+                hint="write cogging_per_turn=N: the least common multiple of poles and slots, times the gear ratio",
             )
         if self.quantity.place == "robot" and (self.each or self.joints != ALL):
-            raise UsageError(f"{self.what} is the whole robot's", hint=f"write {self.what}")
+            raise UsageError(f"{self.what} is a parameter of the whole robot", hint=f"write {self.what}")
 
     @staticmethod
     def parse(text: str) -> ParameterPattern:
@@ -190,27 +193,27 @@ class ParameterPattern:
 
     @property
     def quantity(self) -> Quantity:
-        """Its row of the table."""
+        """Its row of the table ``QUANTITIES``."""
         return QUANTITIES[self.what]
 
     @property
     def absent(self) -> bool:
-        """Whether it is a limit that an optional term may add: without it, there is none."""
+        """Whether it is a limit that only an optional term adds."""
         return self.what in LIMITS and bool(self.term) and not self.free
 
     def matches(self, name: str) -> bool:
-        """Return whether it is of a joint or body."""
+        """Return whether the pattern selects a joint or body."""
         return re.fullmatch(self.joints, name, re.DOTALL) is not None
 
 
 @dataclass(frozen=True)
 class ParameterAt:
-    """A parameter, and where its value belongs.
+    """A parameter, and the joints or bodies to which its value belongs.
 
     Attributes:
         parameter: The parameter.
         what: The quantity.
-        at: Numbers of the joints in the robot's order; of ``payload``, of the model's bodies.
+        at: Numbers of the joints in the robot's order; for ``payload``, numbers of the model's bodies.
     """
 
     parameter: Parameter
@@ -219,7 +222,7 @@ class ParameterAt:
 
     @property
     def among_limits(self) -> bool:
-        """Whether it is a limit that no pattern names: the file's own limits hold, too."""
+        """Whether it is a limit that no pattern names: then the file's limits hold, too."""
         return self.what in LIMITS and bool(self.parameter.term) and not self.parameter.free
 
 
@@ -231,15 +234,15 @@ def usual_patterns(
 ) -> tuple[ParameterPattern, ...]:
     """Return the patterns of the parameters that are identified if the user names none.
 
-    Stiffness or gain, damping and inertia are one value for each group of like joints, dry friction is each joint's
-    own. The drive's damping and the joint's can be separated only where torque is switched off or the log has gains of
-    its own: else there is one.
+    Each group of like joints has one stiffness or gain, one damping and one inertia; each joint has its own dry
+    friction. The damping of the drive can be told from that of the joint only if torque is switched off in the log, or
+    if the log has gains; otherwise there is one damping.
 
     Args:
-        commands: Fields of the log that drive.
-        physical: Whether the log's own gains are in N m/rad and N m s/rad: then factors of them are identified, one
-            for all joints.
-        model: The file's model, whose figures make the groups; default: all joints are one group.
+        commands: Fields of the log that drive joints.
+        physical: Whether the log has gains in N m/rad and N m s/rad: then one factor on them is identified for all
+            joints.
+        model: The file's model, by whose values joints are grouped; default: all joints are one group.
         joints: The recorded joints.
     """
     factors: list[ParameterPattern] = []
@@ -266,10 +269,7 @@ def usual_patterns(
 
 
 def alike_joints(model: MjModel, joints: Sequence[str]) -> list[list[str]]:
-    """Return the joints in groups whose drives the file describes with the same figures.
-
-    The figures are gains, torque limit, damping, inertia and friction.
-    """
+    """Return groups of joints for which the file has the same gains, torque limit, damping, inertia and friction."""
     groups: dict[object, list[str]] = {}
     for joint in joints:
         dof = model.joint(joint).dofadr[0]
@@ -280,7 +280,7 @@ def alike_joints(model: MjModel, joints: Sequence[str]) -> list[list[str]]:
 
 
 def _group_names(groups: Sequence[Sequence[str]], most: int = 3) -> list[str]:
-    """Return the words that only a group's joints share, such as ``calf``; else the names of its first joints."""
+    """Return a name for each group: words that only its joints share, such as ``calf``, or its first joints."""
     words = [[re.findall(r"[A-Za-z0-9]+", joint) for joint in joints] for joints in groups]
     names = []
     for i, joints in enumerate(groups):
@@ -289,24 +289,26 @@ def _group_names(groups: Sequence[Sequence[str]], most: int = 3) -> list[str]:
         first = "_".join("_".join(joint) for joint in words[i][:most])
         more = f"_and_{len(joints) - most}" if len(joints) > most else ""
         names.append("_".join(own) if own and len(joints) > 1 else first + more)
-    # Names without Latin letters, or that differ in signs alone, are numbered.
+    # Number names without Latin letters, and names that differ only in punctuation.
     return names if len({*names, ""}) > len(names) else [f"group{i + 1}" for i in range(len(names))]
 
 
 def with_optional(
     patterns: Sequence[ParameterPattern], wanted: str = "all", joints: Sequence[str] = ()
 ) -> tuple[ParameterPattern, ...]:
-    """Return the patterns, and one for all joints for each further quantity of the optional terms.
+    """Return the patterns, and a pattern for each further quantity of the optional terms.
 
     These quantities are 0 unless ``--terms`` chooses their terms.
 
     Args:
-        wanted: ``auto``, ``all``, or names separated by commas, in addition to those of ``auto``. A quantity that a
-            pattern names is available without the others of its term.
+        wanted: ``auto``, ``all``, or names separated by commas, in addition to ``auto``. A quantity that a pattern
+            names is available without the other quantities of its term.
     """
     named, names = {p.what for p in patterns}, {n.strip() for n in wanted.split(",")}
     if "cogging" in names and "cogging_per_turn" not in named:
-        raise UsageError("cogging needs its number of repeats in a turn", hint="add --parameter cogging_per_turn=N")
+        raise UsageError(
+            "cogging needs the number of its periods in a turn of the joint", hint="add --parameter cogging_per_turn=N"
+        )
 
     def offered(term: str) -> bool:
         if not any(QUANTITIES[what].named for what in TERMS[term]) or term in names:
@@ -325,13 +327,14 @@ def with_optional(
 
 _SIDES = {"l", "r", "left", "right", "fl", "fr", "rl", "rr", "lf", "rf", "lr", "lh", "rh", "hl", "hr", "bl", "br",
           "front", "rear", "hind", "back", "upper", "lower", "joint"}  # fmt: skip
-"""Words of a name that distinguish several alike joints."""
+"""Words by which the names of like joints differ."""
 _MOST_JOINTS = 8
-"""Most joints of a robot that `auto` gives a value each: with 12 joints a term has up to 11 parameters."""
+"""`auto` gives each joint its own value in robots of up to this many joints: with 12, a term has up to 11 parameters.
+"""
 
 
 def like_joints(joints: Sequence[str]) -> list[list[str]]:
-    """Return groups of joints with like names: names that are equal apart from sides and numbers."""
+    """Return groups of joints whose names are equal except for sides and numbers."""
     groups: dict[tuple[str, ...], list[str]] = {}
     for name in joints:
         words = re.findall(r"[a-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower())
@@ -340,10 +343,10 @@ def like_joints(joints: Sequence[str]) -> list[list[str]]:
 
 
 def sharing(patterns: Sequence[ParameterPattern], joints: Sequence[str], wanted: str) -> list[ParameterPattern]:
-    """Return the factors by which groups of joints, or single joints, differ from the first of those with one value.
+    """Return the factors by which groups of joints, or joints, differ from the first joint with the same value.
 
     Args:
-        wanted: ``auto``, ``all``, or names of terms with commas between.
+        wanted: ``auto``, ``all``, or names of terms separated by commas.
     """
     names, found = {n.strip() for n in wanted.split(",")}, list[ParameterPattern]()
     for pattern in patterns:
@@ -365,7 +368,7 @@ def sharing(patterns: Sequence[ParameterPattern], joints: Sequence[str], wanted:
 
 
 def _shared_words(part: Sequence[str]) -> str:
-    """Return the name of a joint, or the words that the names of a group share."""
+    """Return the name of a joint, or the words that all names of a group share."""
     names = [re.split(r"\W+|_", name) for name in part]
     return "_".join(piece for piece in names[0] if all(piece in other for other in names))
 
@@ -379,11 +382,11 @@ def expand(
     """Return the parameters of a model.
 
     Args:
-        model: With drives.
-        file_model: As the file has it.
+        model: Compiled model with drives.
+        file_model: Compiled model of the file.
     """
     found: list[ParameterAt] = []
-    # Without a damping of the drive, the joint's damping includes that of the file's servo.
+    # If the drive has no damping, the joint's damping includes the damping of the file's servo.
     quantities = {pattern.what for pattern in patterns}
     whole_damping = "kp" in quantities and "kd" not in quantities
     bodies = [model.body(i).name for i in range(1, model.nbody)]
@@ -396,7 +399,7 @@ def expand(
                 f"{pattern.what!r}: {pattern.joints!r} matches none of {', '.join(names)}",
                 hint="a pattern matches whole names: .*_hip_joint",
             )
-        # Joints with one value form a group; slides have other units than hinges.
+        # Joints with a common value form a group; slides and hinges have different units.
         sliding = set() if of_body or pattern.quantity.place == "robot" else set(slides_of(file_model, names))
         slides = [i for i in at if names[i] in sliding]
         hinges = [i for i in at if names[i] not in sliding]
@@ -417,7 +420,7 @@ def expand(
 
 
 def letters(pattern: str) -> str:
-    """Return the letters and digits of a name or a pattern, words apart."""
+    """Return the words of a name or a pattern, separated by underscores."""
     return re.sub(r"\W+", "_", pattern.replace(".*", "")).strip("_") or "all"
 
 
@@ -433,7 +436,7 @@ def _parameter(
         low, high, linear = NO_LIMIT / 1e9, NO_LIMIT, False
     elif quantity.scale == "factor":
         low, high = nominal / quantity.low, nominal * quantity.high
-        if what == "gain":  # a log may have the force at the joint although the file's motor has a gear
+        if what == "gain":  # the log may have the force at the joint, although the file's motor has a gear
             low, high = min(nominal, 1.0) / quantity.low, max(nominal, 1.0) * quantity.high
     elif quantity.scale:
         size = _nominal(replace(pattern, what=quantity.scale, nominal=None, term="", free=True), names, file_model)
@@ -464,7 +467,7 @@ def _nominal(
     """Return the nominal value: the median of the joints' values in the file.
 
     Args:
-        whole_damping: Whether a joint's damping includes that of the file's servo.
+        whole_damping: Whether a joint's damping includes the damping of the file's servo.
     """
     what, quantity = pattern.what, pattern.quantity
     if pattern.nominal is not None:
@@ -475,7 +478,7 @@ def _nominal(
         return float(np.median(file_model.body_gravcomp[file_model.body_gravcomp > 0.0]))
     if quantity.scale != "factor":
         return quantity.nominal
-    # The file's values, of joints that have one.
+    # The values of the joints that have one in the file.
     values: list[float | None] = []
     for name in names:
         gains = gains_of(file_model, name)
@@ -540,7 +543,7 @@ def place(
 
 
 def of_each(p: ParameterAt, placed: Sequence[ParameterAt], values: Mapping[str, Scalar]) -> Array:
-    """Return the value of a parameter at each of its joints, ``(joints,)``, times the factors that they have."""
+    """Return the value of a parameter at each of its joints, ``(joints,)``, times the joint's factors."""
     value = jnp.full(len(p.at), jnp.asarray(values[p.parameter.name], float))
     for factor in placed:
         if factor.what == f"{p.what}_factor":
@@ -553,7 +556,7 @@ def tilted(placed: Sequence[ParameterAt], values: Mapping[str, Scalar], gravity:
     """Return gravity ``(3,)`` [m/s^2] turned about the model's x axis, then about its y axis.
 
     Args:
-        gravity: As the model has it, ``(3,)`` [m/s^2].
+        gravity: Gravity of the model, ``(3,)`` [m/s^2].
     """
     angle = {p.what: values[p.parameter.name] for p in placed if p.what.startswith("tilt")}
     if not angle:

@@ -61,7 +61,7 @@ mj: Any = mujoco
 ROBOT_FILE = "robot.toml"
 COMMANDS = tuple(f.name for f in fields(DriveCommand))
 DRIVING = ("goal", "goal_velocity", "torque", "duty")
-"""Fields of commands; a robot has at least one of them."""
+"""Fields of commands that a log may have; a robot needs at least one."""
 
 
 @dataclass(frozen=True)
@@ -76,14 +76,14 @@ class RobotConfig:
         velocity: Whether measured velocities are compared.
         rate_hz: Samples per second of the log, at most [Hz].
         step_s: Time step of the simulation [s].
-        sigma_rad: Deviation of a measured position [rad].
-        sigma_rad_s: Deviation of a measured velocity [rad/s].
-        kp_unit: The value of 1 in the log's unit of stiffness.
-        kd_unit: The value of 1 in the log's unit of damping.
+        sigma_rad: Standard deviation of a measured position [rad].
+        sigma_rad_s: Standard deviation of a measured velocity [rad/s].
+        kp_unit: One unit of the log's stiffness [N m/rad].
+        kd_unit: One unit of the log's damping [N m s/rad].
         volts_unit: Supply voltage at which the drive has the identified strength [V].
         fix_base: Whether a floating base is held.
         hold: Positions of joints that were not recorded: ``JOINT=VALUE`` [rad or m], or the name of a keyframe.
-        payload_body: Body that holds the payload that a log names; "": that of the last joint.
+        payload_body: Body that holds a log's payload; "": the last joint's body.
     """
 
     model: Path
@@ -114,7 +114,7 @@ class RobotConfig:
         return self.model, self.joints, self.step_s, self.fix_base, self.contacts, rubbing, self.hold, carried, holder
 
     def held(self) -> Holding:
-        """Return the held and the free joints among those that were not recorded."""
+        """Return which unrecorded joints are held, and which move."""
         return held_in(self.model, read_model(self.model), self.joints, self.fix_base, self.hold)
 
     def to_toml(self, model: str) -> str:
@@ -135,7 +135,7 @@ class RobotConfig:
         """Read a ``robot.toml``; the path of its model is relative to it.
 
         Raises:
-            UsageError: When a key is unknown, missing or of the wrong kind.
+            UsageError: A key is unknown or missing, or its value has the wrong type.
         """
         keys = [f.name for f in fields(RobotConfig)]
         try:
@@ -202,12 +202,12 @@ class MjcfRobot(LoggedRobot):
         still = {n: jnp.zeros(1 if n in config.shared else len(config.joints)) for n in config.commands}
         units = config.kp_unit, config.kd_unit, config.volts_unit
         world = DrivenWorld("world", 1 / config.step_s, self.model, units, terms=self.lawful)
-        world.derives = "payload" in config.commands  # without mass a joint has another inertia for its friction
+        world.derives = "payload" in config.commands  # at mass 0, the inertia for the joint's friction would differ
         sensor = Encoders("sensor", config.rate_hz, world, config.velocity)
         return sensor, RecordedActuator("actuator", config.rate_hz, DriveCommand(**still)), world
 
     def doubts(self, outputs: Mapping[str, PyTree]) -> list[str]:
-        """Return a sentence on recorded positions beyond a joint's range, or at which a loop of the model cannot close.
+        """Return sentences on recorded positions beyond a joint's range, or where a loop of the model cannot close.
 
         Raises:
             UsageError: When a joint moves further than its range is wide.
@@ -218,10 +218,10 @@ class MjcfRobot(LoggedRobot):
         return [*beyond, *_open_loops(self.make_nodes()[2].gaps, position, self.config.joints, file)]
 
     def with_optional_terms(self, wanted: str = "all") -> MjcfRobot:
-        """Return the robot with optional terms to choose from; a step of its simulation then takes longer.
+        """Return the robot with optional terms, from which identification chooses; its simulation takes longer.
 
         Args:
-            wanted: ``auto``, ``all``, or names with commas between.
+            wanted: ``auto``, ``all``, or names separated by commas.
         """
         heavy = bool(np.any(self.model.opt.gravity))
         offered = with_optional(self.config.terms, wanted, self.config.joints)
@@ -238,7 +238,7 @@ class MjcfRobot(LoggedRobot):
         return IdentifiableMjcf(self, max_delay_s)
 
     def base(self, params: DriveParams) -> DriveParams:
-        """Return the world's parameters before any is identified: the model's, and drives as the terms have them."""
+        """Return the world's parameters before identification: the model's values, and drives without terms."""
         n, driving = len(self.config.joints), set(self.config.commands)
         zero, one = jnp.zeros(n), jnp.ones(n)
         return params.replace(
@@ -251,13 +251,14 @@ class MjcfRobot(LoggedRobot):
         )
 
     def exported(self, values: Mapping[str, Scalar]) -> Exported:
-        late = Late(0.5 * self.config.step_s)  # for the integrator's sake, as `DrivenWorld` does in the graph
+        # The integrator moves joints early; `DrivenWorld` adds the same time in the graph.
+        late = Late(0.5 * self.config.step_s)
         return Exported(self._mjcf(values), late, partial(self._plain, values))
 
     def _mjcf(self, values: Mapping[str, Scalar]) -> str:
-        """Return the file's model with the identified values: friction, inertia, payload, tilt, and each joint's drive.
+        """Return the file's model with the identified friction, inertia, payload, tilt, and drive of each joint.
 
-        Where the log has gains of its own in N m/rad they are the command's, and the file's own actuators stay.
+        If the log has gains in N m/rad, they belong to the command, and the file's actuators stay.
         """
         config, commands, spec = self.config, self.config.commands, read_spec(self.config.model)
         loop, named = self.identifiable(1.0), {p.what for p in self.placed}
@@ -273,7 +274,7 @@ class MjcfRobot(LoggedRobot):
             gains = (np.asarray(rows, np.float64).tolist() for rows in (world.kp, world.kd, world.gain))
             for joint, limit, kp, kd, gain in zip(config.joints, limits, *gains, strict=True):
                 set_drive(spec, joint, control, kp, kd, gain, limit)
-        # Copy what is identified of joints and bodies.
+        # Copy the identified numbers of joints and bodies.
         model = spec.compile()
         dofs = np.array([model.joint(name).dofadr[0] for name in config.joints])
         for p in self.placed:
@@ -285,7 +286,7 @@ class MjcfRobot(LoggedRobot):
                 value = float(values[p.parameter.name])
                 model.body_gravcomp[1:] = np.where(compensated.any() & ~compensated, 0.0, value)[1:]
             elif p.what == "payload":
-                # By name: a body that hangs on a held joint may be fused in one of both models.
+                # Look up by name: a body on a held joint may be fused with its parent in one of the two models.
                 for i in p.at:
                     name = self.model.body(i).name
                     model.body_mass[model.body(name).id if name else i] += float(values[p.parameter.name])
@@ -297,7 +298,7 @@ class MjcfRobot(LoggedRobot):
     def _plain(self, values: Mapping[str, Scalar]) -> PlainSimulation:
         if "payload" in self.config.commands:
             raise UsageError(
-                "a model card reproduces logs without a payload, and these name one",
+                "a model card reproduces logs without a payload, but these logs have one",
                 hint="export to mjcf or to json: the payload is not part of the model there",
             )
         loop, world, how = self.identifiable(1.0), self.make_nodes()[2], self.config.how(*self._how)
@@ -307,7 +308,7 @@ class MjcfRobot(LoggedRobot):
 class IdentifiableMjcf(IdentifiableRecording):
     """Simulates what the encoders measured; an ``identification.model.IdentifiableModel``.
 
-    Encoders are read a tick later than recorded, and interpolate a tick back: nothing shifts.
+    Encoders are read a tick later than recorded, and interpolate a tick back, so the prediction does not shift.
 
     Attributes:
         joints, dofs: Numbers of the joints in the model, and of their degrees of freedom.
@@ -363,14 +364,14 @@ class IdentifiableMjcf(IdentifiableRecording):
         }
 
 
-# -- recordings that a model cannot have
+# -- recordings that are impossible in the model
 
 _CHECKED, _OPEN = 100, 5e-3
-"""Number of recorded positions at which loops must close, and the largest error of a closed one [m or rad]."""
+"""Number of recorded positions at which loops must close, and the largest error of a closed loop [m or rad]."""
 _WIDER = 1.1
-"""Ratio of a joint's motion to its range from which the range is wrong, whichever zero the log has."""
+"""A range is wrong if the joint moves further than this many times its width, whatever the log's zero is."""
 _BEYOND, _OFTEN = 0.1, 0.05
-"""How far beyond a range positions count, as a share of its width; share of samples there from which they do."""
+"""Positions are beyond a range by this share of its width; and the smallest share of samples that is reported."""
 
 
 def _beyond_ranges(model: MjModel, joints: Sequence[str], position: np.ndarray, file: str) -> list[str]:
@@ -390,7 +391,7 @@ def _beyond_ranges(model: MjModel, joints: Sequence[str], position: np.ndarray, 
         if last - first > _WIDER * (high - low):
             raise UsageError(
                 f"{moves} {high:.3g}: the model cannot move that far",
-                hint='MJCF takes ranges in degrees, unless it has <compiler angle="radian"/>; or check the log\'s unit',
+                hint='MJCF reads ranges in degrees, unless it has <compiler angle="radian"/>; or check the log\'s unit',
             )
         room = _BEYOND * (high - low)
         often = float(np.mean((position[:, i] < low - room) | (position[:, i] > high + room)))
@@ -415,7 +416,7 @@ def _open_loops(
 
 
 def _check_payload(sent: Mapping[str, np.ndarray], commands: Collection[str]) -> None:
-    """Raise an error if the payload changes within a log, or is no mass.
+    """Raise an error if the payload changes within a log, or is negative.
 
     Args:
         sent: The log's commands by field.
@@ -436,9 +437,9 @@ def _check_payload(sent: Mapping[str, np.ndarray], commands: Collection[str]) ->
 # -- what recordings reach, which bounds the search for limits
 
 _WINDOW_S = 0.06
-"""Length of the parabolas that give speeds and accelerations [s]."""
+"""Length of the parabolas that are fitted to positions, for speeds and accelerations [s]."""
 _MOST = 0.99
-"""Quantile that counts as reached: single samples may be wrong."""
+"""Quantile that counts as the largest value, because single samples may be wrong."""
 _STATES = 2000
 """Most states of a log whose torques are computed."""
 
@@ -446,7 +447,7 @@ _STATES = 2000
 def _reached(model: MjModel, joints: np.ndarray, episode: Episode) -> tuple[np.ndarray, np.ndarray]:
     """Return the largest torques and speeds of the recorded joints, ``(joints,)`` each [N m, rad/s].
 
-    The torques are those that the model's masses need for the measured motion. Friction adds to them.
+    The torques are those for the model's masses and the measured motion, without friction.
 
     Args:
         joints: Shape ``(joints,)``: their numbers in the model.
@@ -461,7 +462,7 @@ def _reached(model: MjModel, joints: np.ndarray, episode: Episode) -> tuple[np.n
 
 
 def _derivatives(t_s: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return speeds and accelerations ``(N, joints)`` of positions, by parabolas through the samples around each."""
+    """Return speeds and accelerations ``(N, joints)``, by a parabola through the positions around each sample."""
     from scipy.signal import savgol_filter  # 0.3 s
 
     period_s = float(np.median(np.diff(t_s)))

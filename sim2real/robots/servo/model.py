@@ -34,32 +34,37 @@ if TYPE_CHECKING:
 mj: Any = mujoco
 
 OFFSET = "goal_offset"
-"""Constant difference between a servo's position and its goal [rad]: of the zeros, or of worn gears."""
+"""Largest constant difference between a servo's position and its goal, from zeros or worn gears [rad]."""
 _NAMES = ("gain", "damping", "armature", "friction")
 _NEVER = 1e9
-"""Speed that stands for an infinite one [rad/s]."""
+"""Speed that stands for infinity [rad/s]."""
 LIMIT_RAD: Final = 0.15
-"""Largest distance of a joint from where goals, weight and friction put it [rad]. In sound deployments with any payload
-up to the heaviest it was 0.11 rad."""
+"""Largest distance of a sound joint from where goals, weight and friction put it [rad]; 0.11 rad was measured with all
+payloads.
+"""
 _SHARE, _LEAST_RAD_S = 0.5, 0.1
-"""Poses in which the weight is taken; share of the free speed, and least speed [rad/s], of a joint on its way."""
+"""Number of poses in which the weight is computed; lowest speed of a moving joint, as a share of the free speed and in
+rad/s.
+"""
 _MOST_OFFSET_RAD = 0.05
 _SOON, _STOPS = [1e-4, 1.0], [0.995, 0.995, 0.001, 0.5, 2.0]
-"""Friction stops a joint within two time steps, to which MuJoCo lengthens the time constant. At the default impedance
-joints creep as slow motions go; at 0.999 the solver's single precision does not find the force that holds a joint."""
+"""MuJoCo's solref and solimp of dry friction, which stops a joint within two time steps. At the default impedance
+joints creep; at 0.999 the solver, in single precision, does not find the force that holds a joint.
+"""
 
 
 @dataclass(frozen=True)
 class Hand:
     """The hand of a robot, which may hold a payload.
 
-    The payload's inertia about its centre is neglected: the rotors' inertia behind gears is far larger.
+    The payload's inertia about its centre is neglected: the inertia of the rotors, behind gears, is far larger.
 
     Attributes:
-        joint: The joint that moves the link which holds it.
+        joint: The joint that moves the link with the hand.
         at_m: Position of a payload in the frame of this link [m].
-        most_kg: Largest mass that it can bear [kg].
-        least_kg: Smallest change since the identification [kg], a negative number; the link weighs more.
+        most_kg: Largest payload [kg].
+        least_kg: Lower bound of the payload [kg], negative if mass was removed since the identification; the link
+            weighs more.
     """
 
     joint: str
@@ -68,7 +73,7 @@ class Hand:
     least_kg: float = 0.0
 
     def parameter(self) -> Parameter:
-        """Return the payload: 0 without the optional term, as a gain and a mass are hard to separate."""
+        """Return the payload, an optional term: a gain and a mass are hard to separate."""
         about = "mass in the hand, beyond that of the model"
         more: dict[str, Any] = {"about": about, "free": False, "term": PAYLOAD, "off": 0.0}
         return Parameter(PAYLOAD, "kg", 0.0, self.least_kg, self.most_kg, "linear", **more)
@@ -103,7 +108,7 @@ class ServoModel(RobotModel):
         return [*of_servos, self.hand.parameter()] if self.hand else of_servos
 
     def make_world(self, resumed: bool = False) -> ServoWorld:
-        from sim2real.robots.servo.world import ServoWorld  # record imports no physics
+        from sim2real.robots.servo.world import ServoWorld  # imported late: record needs no physics
 
         s = self.servos
         profiles = [s.sheet.profile_rad_s / gear for gear in s.gears]
@@ -128,7 +133,7 @@ class ServoModel(RobotModel):
         )
         # Motors and joints.
         motors = self._motors
-        stiffness, most = gain * gear**2, gain * limit_rad * gear  # the torque limit is that at full duty
+        stiffness, most = gain * gear**2, gain * limit_rad * gear  # the torque limit is the torque at full duty
         numbers: dict[str, PyTree] = {n: jnp.asarray(getattr(model, n), jnp.float32) for n in _SET}
         numbers["actuator_gainprm"] = numbers["actuator_gainprm"].at[motors, 0].set(stiffness)
         bias = numbers["actuator_biasprm"].at[motors, 0].set(gain * offset * gear)
@@ -151,8 +156,8 @@ class ServoModel(RobotModel):
         return numbers | {"body_mass": masses.at[link].set(total), "body_ipos": centres.at[link].set(middle)}
 
     def exported(self, values: Mapping[str, Scalar]) -> Exported:
-        # MuJoCo adds half a step for its leapfrog, as in the graph, and half a step because it uses setpoints of a
-        # step's end. In the graph a goal acts as its mean over a tick, so a profile starts up to a tick early.
+        # In MuJoCo add half a step for its leapfrog, as in the graph, and half a step because it uses the setpoints of
+        # # a step's end. In the graph a goal acts as its mean over a tick, so a profile starts up to a tick early.
         late = Late(self.step_s - 0.25 * self.tick_s, self.servos.sheet.profile_rad_s)
         return Exported(converged(self._identified(values)), late, partial(self._plain, values))
 
@@ -183,7 +188,7 @@ class ServoModel(RobotModel):
         """Return an emulated robot with this model's physics.
 
         Args:
-            emulator: Latencies and losses; the servos' model is the data sheet's.
+            emulator: Latencies and losses; the data sheet gives the servo model.
             **factors: Factors on the data sheet's ``gain``, ``damping``, ``armature`` and ``friction``.
 
         Raises:
@@ -235,7 +240,7 @@ class ServoModel(RobotModel):
         return np.array([driven.index(self.model.joint(name).id) for name in self.servos.names])
 
     def _stribeck(self, values: Mapping[str, Scalar]) -> PyTree:
-        """Return the speeds of joints at which 1/e of their friction is left [rad/s]; None: it is the same at all."""
+        """Return for each joint the speed at which 1/e of its friction is left [rad/s]; None: constant friction."""
         if self.servos.sheet.stribeck_rad_s is None:
             return None
         gears = np.array(self.servos.gears, np.float32)
@@ -245,7 +250,8 @@ class ServoModel(RobotModel):
         """Return the MJCF with a servo on each joint, and options that make its steps fast.
 
         Args:
-            stops: Whether joints keep the file's ranges; the goals' limits keep a robot off its stops.
+            stops: Whether joints keep the ranges of the file; otherwise only the goals' limits keep the robot off its
+                stops.
         """
         if not self.mjcf.is_file():
             raise UsageError(f"there is no model {self.mjcf}", hint="an MJCF file beside robot.py")
@@ -265,8 +271,8 @@ class ServoModel(RobotModel):
             motor.forcelimited, motor.forcerange = True, [-sheet.stall * gear, sheet.stall * gear]
         option = spec.option
         option.timestep, option.integrator = self.step_s, mj.mjtIntegrator.mjINT_IMPLICITFAST
-        # After two seconds one step of Newton's method is 0.8 mrad off a hundred of them, at a seventh of the time of
-        # training. Only joints that friction should hold shiver, by 0.05 rad/s, and creep: a deployment takes more.
+        # One Newton step is 0.8 mrad off a hundred steps after two seconds, and makes training seven times as fast. But
+        # # joints that friction should hold shiver, by 0.05 rad/s, and creep: a deployment takes more steps.
         option.iterations, option.ls_iterations = 1, 4
         option.disableflags |= int(mj.mjtDisableBit.mjDSBL_CONTACT)
         return spec
@@ -280,7 +286,7 @@ class ServoModel(RobotModel):
                 getattr(model, name)[...] = array
         spec.copy_back(model)
         if self.hand is not None:
-            # Of a body, the centre of mass counts, and the inertia about it stays.
+            # The centre of mass of a body changes, the inertia about it stays.
             link = int(model.jnt_bodyid[model.joint(self.hand.joint).id])
             body: Any = spec.body(model.body(link).name)
             body.explicitinertial, body.mass = True, float(numbers["body_mass"][link])
@@ -303,7 +309,7 @@ def servo_parameters(sheet: DataSheet, joints: Sequence[str], own: Sequence[str]
     grease and gears changes the friction of all joints.
 
     Args:
-        own: Quantities with a value for each joint, named as ``friction_JOINT``; joints share the others.
+        own: Quantities with a value for each joint, named like ``friction_JOINT``; all joints share the others.
     """
     table = {
         "gain": ("N m/rad", sheet.gain, 3, "torque per error, at the P gain in use"),
@@ -330,18 +336,18 @@ def servo_parameters(sheet: DataSheet, joints: Sequence[str], own: Sequence[str]
 
 
 def goal_offsets(joints: Sequence[str]) -> list[Parameter]:
-    """Return the offset of each servo from its goals, for ``dynamics``."""
+    """Return the parameters for the offset of each servo from its goals, for ``dynamics``."""
     about, most = "rest position without load, from its goal", _MOST_OFFSET_RAD
     names = [f"{OFFSET}_{joint}" for joint in joints]
     return [Parameter(name, "rad", 0.0, -most, most, "linear", about=about) for name in names]
 
 
 def _each(values: Mapping[str, Scalar], name: str, joints: Sequence[str], otherwise: float | None) -> PyTree:
-    """Return the value of every joint's servo ``(joints,)``: its own, otherwise the shared one.
+    """Return the value for each joint ``(joints,)``: ``name_JOINT`` if it exists, otherwise the shared ``name``.
 
     Args:
-        name: Such as ``gain``; a joint's own is ``gain_JOINT``.
-        otherwise: The value without both; None: a missing value is an error.
+        name: Such as ``gain``.
+        otherwise: The value if neither exists; None: a missing value is an error.
     """
     shared = values.get(name, otherwise)
     entries = {f"{name}_{joint}": values.get(f"{name}_{joint}", shared) for joint in joints}
@@ -385,8 +391,8 @@ def identified_following(mjcfs: Sequence[str], joints: Sequence[str]) -> Followi
     damping = np.maximum(model.dof_damping[dofs], 1e-9)
 
     def speeds(position_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        # On a longer way a joint has at least a share of the speed at which damping takes what weight and friction
-        # leave of its torque.
+        # On a long way, a joint reaches at least a share of the speed at which damping takes the torque that weight and
+        # # friction leave.
         lowest, highest = weight(position_rad)
         left = most_rad - np.maximum(highest, 0.0), most_rad + np.minimum(lowest, 0.0)
         downwards, upwards = (np.clip(_SHARE * rad * stiffness / damping, _LEAST_RAD_S, None) for rad in left)

@@ -1,4 +1,4 @@
-"""A robot's position servos: data sheet, limits and joints, their measurements and commands."""
+"""A robot's position servos: data sheet, limits, joints, measurements and commands."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ class DataSheet:
         stall: Torque at full duty and standstill [N m].
         damping: Back-EMF and viscous friction together, about ``stall`` divided by the no-load speed [N m s/rad].
         armature: Inertia of the rotor, as seen at the gear's output [kg m^2].
-        friction: Dry friction [N m], at standstill if it decreases with speed.
+        friction: Dry friction [N m]; the value at standstill, if it decreases with speed.
         p_gain: Position P Gain [counts].
         d_gain: Position D Gain [counts].
         profile_rad_s: Profile Velocity [rad/s].
         model_number: Model number of the servos; a twin of the robot emulates that model's firmware.
-        stribeck_rad_s: Speed at which 1/e of the dry friction is left [rad/s]; None: it is the same at every speed.
+        stribeck_rad_s: Speed at which 1/e of the dry friction is left [rad/s]; None: it does not depend on speed.
     """
 
     stall: float
@@ -89,11 +89,11 @@ class Servos:
     """The servos on the bus, in the order of the joints.
 
     Attributes:
-        joints: Their names, or the joints with zero, direction and gear; a zero is the device's reading there.
+        joints: Names, or joints with zero, direction and gear; a zero is the device's reading at the joint's angle 0.
         ids: Numbers on the bus.
         low: Lowest goals [rad].
         high: Highest goals [rad].
-        sheet: Their data sheet and settings.
+        sheet: Data sheet and settings.
         speed: Largest speed of a policy's goals [rad/s].
         rest: Positions of the joints without torque [rad]; default: 0.
         rest_tolerance: Largest distance of an episode's start from ``rest`` [rad].
@@ -126,7 +126,7 @@ class Servos:
 
     @property
     def gears(self) -> tuple[float, ...]:
-        """Turns of each servo for one of its joint."""
+        """Turns of each servo for one turn of its joint."""
         return tuple(joint.gear for joint in self.mounting)
 
     @property
@@ -143,7 +143,7 @@ class ServoDrive(RobotDrive):
 
     Args:
         embedded: Returns the emulated robot; None: there is none.
-        settings: Returns the device's settings, given whether it is the emulated one; default: the data sheet's.
+        settings: Returns the device's settings, given whether it is emulated; default: the data sheet's.
     """
 
     command, message = "goal", Goals
@@ -175,7 +175,7 @@ class ServoDrive(RobotDrive):
         return self.servos.mounting
 
     def embedded(self, hanging: bool = False) -> Embedded | None:
-        # Position 0 of a plain joint is where the servo's encoder is at half a turn.
+        # A joint without a mounting has its angle 0 where the servo's encoder reads half a turn.
         return replace(robot, zero_rad=math.pi) if self._embedded and (robot := self._embedded()) else None
 
     def device(self, port: str, silence_s: float, embedded: bool) -> Device:
@@ -199,7 +199,7 @@ class ServoDrive(RobotDrive):
         rest = self.servos.at_rest
         position = rig.wait_until_still(settle_s).position_rad
         if np.max(np.abs(position - rest)) > _AT_HOME_RAD:
-            self._move(rig, position, rest)  # a joint without weight stays where it was left
+            self._move(rig, position, rest)  # a joint that carries no weight stays where it was left
             position = rig.wait_until_still(settle_s).position_rad
         error = np.abs(position - rest)
         worst = int(np.argmax(error))

@@ -1,4 +1,4 @@
-"""The task of a robot of servos: aims, rewards, observation and actions."""
+"""The task of a servo arm: aims, rewards, observation and actions."""
 
 from __future__ import annotations
 
@@ -28,9 +28,10 @@ class Aim:
 
     Attributes:
         entries: Name and unit of each of the k entries.
-        draw: Returns the numbers of an episode ``(m,)``: of training for a key of JAX, of a trial for its number; see
-            ``uniform``. They are the aim itself ``(k,)`` if it does not move.
-        at: Returns the aim ``(k,)`` for an episode's numbers and the time from its start [s]; None: it does not move.
+        draw: Returns the random numbers of an episode ``(m,)``, for a key of JAX (training) or the number of a trial;
+            see ``uniform``. If the aim does not move, the numbers are the aim.
+        at: Returns the aim ``(k,)`` for an episode's numbers and the time from its start [s]; None: the aim does not
+            move.
     """
 
     entries: tuple[tuple[str, str], ...]
@@ -39,7 +40,7 @@ class Aim:
 
 
 def uniform(key: Key | int, low: PyTree, high: PyTree) -> Array:
-    """Return one number between each pair of bounds ``(n,)``, float32; one key always gives the same ones.
+    """Return random numbers between bounds, each ``(n,)`` float32; one key always gives the same numbers.
 
     Args:
         key: A key of JAX, also in a traced function; or a seed of numpy, which needs no JAX.
@@ -50,11 +51,11 @@ def uniform(key: Key | int, low: PyTree, high: PyTree) -> Array:
 
 
 class ServoMoment(NamedTuple):
-    """What a reward sees after a policy step.
+    """The state after a policy step, from which rewards are computed.
 
     Attributes:
-        position: Of the joints ``(joints,)`` [rad].
-        velocity: Of the joints ``(joints,)`` [rad/s].
+        position: Positions of the joints ``(joints,)`` [rad].
+        velocity: Velocities of the joints ``(joints,)`` [rad/s].
         aim: The aim at this time ``(k,)``.
     """
 
@@ -64,7 +65,7 @@ class ServoMoment(NamedTuple):
 
 
 Feature = tuple[str, tuple[str, ...]] | tuple[str, tuple[str, ...], float]
-"""Name and units of a term of the observation, and its largest magnitude [the units] where there is one."""
+"""Name and units of a term of the observation, and its largest magnitude [the units] if it has one."""
 Observe = Callable[[JointReading, Array, Array], Array]
 """Returns the present part of the observation: (reading, goals ``(joints,)`` [rad], aim ``(k,)``) -> ``(features,)``.
 
@@ -72,14 +73,15 @@ In training it gets arrays of JAX, on the robot of NumPy: ``namespace(goals)`` o
 module. ``jax.numpy`` works too, but is slower on the robot."""
 
 _MARGIN_RAD, _SPEED_FACTOR, _FASTEST_RAD_S = math.pi, 5.0, 1e3
-"""Bounds of measurements: distance from the goals' bounds; factor on the servo's speed without load; and the speed
-where the data sheet has no damping."""
+"""Bounds of measurements: how far beyond the goals' bounds [rad]; factor on the servo's speed without load; and this
+speed if the data sheet has no damping [rad/s].
+"""
 
 
 class AimTask(RobotTask):
-    """A task of random aims and starts, half of them at rest.
+    """A task with random aims and random starts, half of them at rest.
 
-    The policy sees positions, velocities, goals, the aim and a short history, and sets the speeds of the goals.
+    The policy observes positions, velocities, goals, the aim and a short history; its actions are the goals' speeds.
 
     Args:
         reward: Returns the reward of a moment; a penalty on the goals' speed is added.
@@ -87,7 +89,7 @@ class AimTask(RobotTask):
         score: Returns figures of a deployment; see ``RobotTask.score``.
         features: Names, units and largest magnitudes of the present part of the observation; None: positions,
             velocities, goals and aim.
-        observe: Makes that part; see ``Observe``.
+        observe: Computes the present part; see ``Observe``.
         history: Past steps in the observation.
     """
 
@@ -129,7 +131,7 @@ class AimTask(RobotTask):
         return EpisodeStart(rest, np.zeros_like(rest), self.aim.draw(trial))
 
     def moved(self, start: EpisodeStart, position: Array, velocity: Array, share: Scalar = 1.0) -> EpisodeStart:
-        del share  # targets are as easy near as far
+        del share  # a target's distance does not make it easier
         low, high = (jnp.asarray(bound) for bound in (self._servos.low, self._servos.high))
         position = jnp.clip(start.position + position, low, high)
         return start.replace(position=position, velocity=start.velocity + velocity)
@@ -181,7 +183,7 @@ def servo_terms(
     if history:
         units = ("rad",) * n + ("rad/s",) * n + ("rad",) * n
         low, high = (position[i] + velocity[i] + goal[i] for i in (0, 1))
-        # Before there is a history, it is 0.
+        # Before the first steps, the history is 0.
         bounds = tuple(min(v, 0.0) for v in low), tuple(max(v, 0.0) for v in high)
         present.append(ObservationTerm("past position, velocity, goal", units, history, *bounds))
     return tuple(present)

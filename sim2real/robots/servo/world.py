@@ -1,4 +1,4 @@
-"""The world of a robot of position servos: an MJCF on MJX, whose setpoints move to their goals with limited speed."""
+"""The world of a servo arm: an MJCF on MJX, whose setpoints move to their goals with limited speed."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ class ServoParams(Base):
         fields: Field of the model -> its values.
         qpos: Positions at the start ``(nq,)`` [rad].
         qvel: Velocities at the start ``(nv,)`` [rad/s].
-        stribeck_rad_s: Speed at which 1/e of the dry friction is left, ``(joints,)``; None: friction is constant.
+        stribeck_rad_s: Speed at which 1/e of the dry friction is left, ``(joints,)`` [rad/s]; None: friction is
+            constant.
     """
 
     fields: dict[str, Any]
@@ -59,32 +60,32 @@ class ServoState(Base):
 
     @property
     def position(self) -> Any:
-        """Of the joints ``(joints,)`` [rad]."""
+        """Positions of the joints ``(joints,)`` [rad]."""
         return self.data.qpos[np.array(self.places[0])]
 
     @property
     def velocity(self) -> Any:
-        """Of the joints ``(joints,)`` [rad/s]."""
+        """Velocities of the joints ``(joints,)`` [rad/s]."""
         return self.data.qvel[np.array(self.places[1])]
 
     @property
     def time_s(self) -> Any:
-        """From the episode's start [s]."""
+        """Time from the episode's start [s]."""
         return self.data.time
 
 
 class ServoWorld(BaseWorld):
-    """Position servos: torque = gain * (setpoint - angle), within a limit; the input from the actuator has the goals.
+    """Position servos: torque = gain * (setpoint - angle), within a limit; the actuator's messages have the goals.
 
-    In a leapfrog scheme as MuJoCo's, a force acts as if half a time step earlier, and velocities belong to half a step
-    earlier. So half a step is added to the delay of the goals, and measured velocities are extrapolated by it: an
-    identified delay is that of the robot.
+    In MuJoCo's leapfrog scheme a force acts half a time step early, and velocities are half a step old. So half a step
+    is added to the delay of the goals, and measured velocities are extrapolated by it: an identified delay is the
+    robot's.
 
     Args:
-        model: Has one position actuator for each joint of a servo.
-        joints: Joints of the servos.
+        model: Model with one position actuator for each joint.
+        joints: Names of the servos' joints.
         profile_rad_s: Largest speeds of the setpoints ``(joints,)``.
-        resumed: Whether episodes begin in the middle of a recording. The setpoints, which are not recorded, then start
+        resumed: Whether episodes begin in the middle of a recording. Then the setpoints, which are not recorded, start
             at the goals of that time; otherwise at the joints' positions, as when torque goes on.
         worn: Whether dry friction decreases with speed.
     """
@@ -112,7 +113,7 @@ class ServoWorld(BaseWorld):
         self._mjx_model, self._apart = mjx.put_model(model, impl="jax"), False
 
     def solve_to_rest(self) -> None:
-        """Solve constraints to the end: with few iterations, joints creep that friction should hold."""
+        """Use many iterations of the solver: with few, joints creep that friction should hold."""
         option = self._mjx_model.opt.replace(iterations=6, ls_iterations=20)
         self._mjx_model = self._mjx_model.replace(opt=option)
 
@@ -176,7 +177,7 @@ class ServoWorld(BaseWorld):
         return state.replace(data=data.replace(qvel=data.qvel.at[self.qvel_at].set(velocity)))
 
     def law_values(self, params: ServoParams) -> dict[str, jax.Array]:
-        """Return friction at standstill [N m], and the speed [rad/s] at which 1/e of it is left, ``(nv,)``."""
+        """Return friction at standstill [N m], and the speed at which 1/e of it is left [rad/s], each ``(nv,)``."""
         friction = jnp.asarray(params.fields.get("dof_frictionloss", self.model.dof_frictionloss))
         widths = jnp.full(friction.shape, jnp.inf)
         if params.stribeck_rad_s is not None:
@@ -195,7 +196,7 @@ class ServoWorld(BaseWorld):
     # -- physics that runs elsewhere, see ``worlds.rollouts``
 
     def open_loop(self) -> MjModel:
-        """Take the physics out and return the ``MjModel``."""
+        """Switch the node's physics off, and return the ``MjModel``."""
         self._apart = True
         return self.model
 
@@ -210,9 +211,8 @@ class ServoWorld(BaseWorld):
     def controls(self, step_state: StepState) -> tuple[StepState, jax.Array]:
         """Return the step state with the setpoints a tick later, and the controls ``(substeps, nu)``.
 
-        A control is the setpoint's mean over its time step. Compared with steps a fifth as long, the arm of
-        pipelines/arm is then off by 0.4 to 1.2 mrad; with the setpoint at the step's end it is half a step early, 2 to
-        4 mrad.
+        A control is the mean of the setpoint over its time step. Compared with steps a fifth as long, the arm of
+        pipelines/arm is then off by 0.4 to 1.2 mrad; with the setpoint at the step's end, by 2 to 4 mrad.
         """
         goal, reference = step_state.inputs[self.input_name].data.goal[-1], step_state.state.reference
         if self._resumed:

@@ -73,7 +73,7 @@ def into_base(quaternion: Array, vector: Any) -> Array:
     """Return a vector of the world ``(3,)`` in the axes of the base.
 
     Args:
-        quaternion: Shape ``(4,)``, w first; its length is taken out, as the mean of two orientations is shorter than 1.
+        quaternion: Shape ``(4,)``, w first; normalised, because the mean of two orientations is shorter than 1.
     """
     xp = namespace(quaternion, vector)
     unit = quaternion / xp.sqrt(xp.sum(quaternion**2))
@@ -83,7 +83,7 @@ def into_base(quaternion: Array, vector: Any) -> Array:
 
 
 def gravity_of(quaternion: Array) -> Array:
-    """Return the direction of gravity in the axes of the base, shape ``(3,)``; ``(0, 0, -1)`` while it is level."""
+    """Return the direction of gravity in the axes of the base, ``(3,)``; ``(0, 0, -1)`` while the base is level."""
     return into_base(quaternion, (0.0, 0.0, -1.0))
 
 
@@ -91,9 +91,9 @@ Place = Literal["floor", "stand"]
 _STILL_RAD_S = 0.3
 """Speed below which a joint is at rest, above the noise of the motors' speeds [rad/s]."""
 _BENT = 0.25
-"""How far a standing robot bends its legs, as a share of the way to folded ones."""
+"""How far a standing robot bends its legs, as a share of the way from the stance to folded legs."""
 _LARGEST = {"dq": 1.0, "kp": 120.0, "kd": 8.0, "tau": 1.0}
-"""Largest magnitude of each column but the target [rad/s, N m/rad, N m s/rad, N m]; kp and kd are at least 0."""
+"""Largest magnitude of dq, kp, kd and tau [rad/s, N m/rad, N m s/rad, N m]; kp and kd are at least 0."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class LegMotors:
         device: Name of the device; see ``sim2real.hardware.registry``.
         folded: Position of each joint while the robot lies on folded legs, from which it stands up [rad].
         settings: Settings of the device.
-        embedded: Returns the emulated robot on the ``floor`` or in a ``stand``; None: there is none.
+        embedded: Returns the emulated robot, on the ``floor`` or in a ``stand``; None: there is none.
     """
 
     device: str
@@ -118,8 +118,8 @@ class StandUp:
     """The start motion: fold the legs, rise to the stance, and wait there.
 
     Attributes:
-        fold_s, rise_s, wait_s: Times of its parts [s].
-        kp, kd: Gains during the motion [N m/rad], [N m s/rad]; a weak motor with small gains does not lift the robot.
+        fold_s, rise_s, wait_s: Durations of the three phases [s].
+        kp, kd: Gains during the motion [N m/rad], [N m s/rad]; with small gains, weak motors do not lift the robot.
     """
 
     fold_s: float = 0.8
@@ -140,12 +140,12 @@ class StandUp:
 
 
 class WalkingDrive(RobotDrive):
-    """Encoders and the IMU's orientation and gyro; targets of all joints, with the same gains for all motors.
+    """Measures encoders, orientation and gyro; commands targets of all joints, with the same gains for all motors.
 
-    Without motors the robot has no device, and its policy walks on the twin alone.
+    Without motors the robot has no device, and its policy walks only on the twin.
 
     Attributes:
-        crouch: Offset from the stance with which a robot on its feet bends its legs ``(joints,)`` [rad].
+        crouch: Offset from the stance to bent legs, for a recording on the feet ``(joints,)`` [rad].
     """
 
     centre: np.ndarray
@@ -187,7 +187,7 @@ class WalkingDrive(RobotDrive):
         if motors is None:
             raise UsageError(
                 f"this robot has no device for port {port!r}",
-                hint="sim2real play lets its policy walk on the twin; LegMotors names the device of a robot",
+                hint="sim2real play lets its policy walk on the twin; for hardware, give the robot LegMotors",
             )
         from sim2real.hardware.registry import load_device
 
@@ -216,7 +216,7 @@ class WalkingDrive(RobotDrive):
                 raise SafetyStop("the robot tipped over while it stood up", hint="lay it on even ground, legs folded")
             command = leg_command(motion.targets(t_s, start, folded, self.centre), motion.kp, motion.kd)
             table = np.stack([getattr(command, column.name) for column in rig.device.commanded.columns], axis=-1)
-            # The gate's time ends at 0, where that of the graph starts.
+            # The gate's time ends at 0, where the graph's time starts.
             rig.command(table, 0.0, t_s - motion.duration_s)
         off = np.abs(reading.position_rad - self.centre)
         if off.max() > 0.5:
@@ -224,7 +224,7 @@ class WalkingDrive(RobotDrive):
             raise SafetyStop(f"{self._joints[worst]} is {off[worst]:.2g} rad off the stance after standing up")
 
     def gate(self, limits: GateLimits, device: Device | None = None) -> GateConfig:
-        """Return the gate: a range for each target, and limits of the other columns."""
+        """Return the gate, with a range for each target, and limits of the other columns."""
         if device is None:
             return super().gate(limits)
         import mujoco

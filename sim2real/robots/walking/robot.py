@@ -1,4 +1,4 @@
-"""A composed task as a robot of the command line: a floating base that follows commanded velocities."""
+"""A walking robot, made of an MJCF file and terms of a reward."""
 
 from __future__ import annotations
 
@@ -26,25 +26,26 @@ if TYPE_CHECKING:
 
 
 class ComposedRobot(Robot):
-    """A robot with a floating base, from an MJCF file, and terms of a reward.
+    """A robot with a floating base that follows commanded velocities.
 
     Attributes:
         mjcf: The model, with its floor.
         joints: Names of the joints, in the order of the motors.
-        feet: Names of the feet: of a sphere, and of a site in its middle.
-        stance: Positions of the joints that the action 0 commands [rad].
+        feet: Names of the feet; a foot is a sphere, and a site of the same name in its middle.
+        stance: Positions of the joints for the action 0 [rad].
         height_m: Height of the base in this stance [m].
         touching_m: Height of a foot's site below which it touches the ground [m].
-        scale: Change of a target by the action 1 [rad].
+        scale: Change of a target for the action 1 [rad].
         policy_hz: Steps of the policy per second [Hz].
-        history: Earlier observations that the policy gets.
+        history: Number of earlier observations that the policy gets.
         gains: kp [N m/rad] and kd [N m s/rad] of the motors, as in the MJCF file.
         motors: The motors on hardware; None: the robot has no device.
-        delays_s: Delays without an identification: of the sensor, of the actuator [s].
-        terrain: Rough ground, on which a training with the parameter ``roughness`` takes place.
-        groups: Name of a group -> numbers of its joints, which have one damping, dry friction and armature; empty: all
-            joints are of the group ``joint``.
-        noise: Field of the reading -> deviation and bias of the noise without an identification, in the field's unit.
+        delays_s: Delays of sensor and actuator without an identification [s].
+        terrain: Rough ground, for a training with the parameter ``roughness``.
+        groups: Name of a group -> numbers of its joints, which share damping, dry friction and armature; empty: all
+            joints are in the group ``joint``.
+        noise: Field of the reading -> standard deviation and bias of its noise without an identification, in the
+            field's unit.
     """
 
     mjcf: ClassVar[Path]
@@ -74,7 +75,7 @@ class ComposedRobot(Robot):
         """Return the terms of the reward by name: weight, and a function of a ``Moment``."""
 
     def falls(self, now: Moment) -> jax.Array:
-        """Return whether the robot has fallen: it lies lower than half of its height, or on its side."""
+        """Return whether the robot has fallen: its base is below half of its height, or it lies on its side."""
         return (now.height < 0.5 * self.height_m) | (now.gravity[2] > -0.5)
 
     def commanded(self, command: tuple[float, float, float]) -> ComposedRobot:

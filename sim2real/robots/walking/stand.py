@@ -29,10 +29,13 @@ if TYPE_CHECKING:
     from sim2real.robots.walking.robot import ComposedRobot
 
 STEP_S, FINE_S = 0.002, 0.001
-"""Time step of the simulation, and the shorter one for which parameters hold [s]: a step acts as armature, of half the
-step times the damping, so the longer step gets less armature. It halves the time of a fit."""
+"""Time step of the simulation, and the shorter step of training, to which parameters refer [s]. A time step acts like
+an armature of half the step times the damping, so the longer step gets less armature. It halves the time of a fit.
+"""
 _STILL_RAD_S, _LEVEL_RAD = 0.04, 0.01
-"""Largest deviations in a stand: of the gyro [rad/s], and of the tilt, which legs on the floor change slowly [rad]."""
+"""Largest standard deviation in a stand: of the gyro [rad/s], and of the tilt [rad], which legs on a floor change
+slowly.
+"""
 
 
 class LegsInAStand:
@@ -47,7 +50,7 @@ class LegsInAStand:
     def __init__(self, robot: ComposedRobot, max_delay_s: float) -> None:
         self.channels, self._rate_hz, self._kd = robot.drive.channels, robot.policy_hz, robot.gains[1]
         self._joints, self._model = robot.model.joints, stand_model(robot.mjcf)
-        # The strengths of the motors take the place of a factor on all of them.
+        # Each motor has a strength, so a common factor on all of them is not identified.
         fixed = [replace(p, free=False) for p in robot.model.around() if p.name == STRENGTH]
         rows = [*self._joints.dynamics(), *fixed, *self._joints.zeros(), *delay_parameters(max_delay_s)]
         self.parameters = ParameterTable(rows)
@@ -68,7 +71,7 @@ class LegsInAStand:
         """Refuse a log in which the base turns: it was not in a stand.
 
         Raises:
-            OtherMotion: The gyro measured rotation, or the tilt changed.
+            OtherMotion: The gyro measured a rotation, or the tilt changed.
         """
         sensed, level = episode.outputs[self.sensor], np.array([[1.0, 0.0, 0.0, 0.0]])
         gyro = np.asarray(sensed.get("gyro", np.zeros((1, 3))), np.float64)
@@ -78,7 +81,7 @@ class LegsInAStand:
             raise OtherMotion(
                 f"the base of the robot moved (its gyro varies by {turning:.2g} rad/s, its tilt by {tilting:.2g} rad), "
                 "and this model is of legs in a stand",
-                hint="record the robot in a stand, with its legs in the air; a log of its load is for --standing",
+                hint="record the robot in a stand, with its legs in the air; give a log on its feet as --standing",
             )
 
     def params(self, values: Mapping[str, Scalar], start: Array) -> dict[str, PyTree]:
@@ -93,7 +96,7 @@ class LegsInAStand:
             field: getattr(self._plain.model, field).at[dofs].set(joints.of_group(values, quantity, jnp))
             for field, quantity in places.items()
         }
-        # A motor's strength is a factor on its whole law.
+        # A motor's strength is a factor on its whole torque.
         strength, zero = (joints.of_motor(values, name, jnp) for name in (MOTOR_STRENGTH, "zero"))
         damping = fields["dof_damping"].at[dofs].add(self._kd * strength)
         fields["dof_armature"] -= 0.5 * (STEP_S - FINE_S) * damping
@@ -115,13 +118,13 @@ def stand_model(mjcf: Path) -> MjModel:
     """Return the model of a walking robot whose base is fixed, with a drive on each joint with an actuator."""
     joints = [actuator.target for actuator in read_spec(mjcf).actuators]
     spec = driven_spec(mjcf, joints, STEP_S, fix_base=True, contacts=False)
-    for geom in spec.geoms:  # MJX knows no collision of some kinds, even where contacts are off
+    for geom in spec.geoms:  # MJX refuses some kinds of geoms, even with contacts switched off
         geom.contype = geom.conaffinity = 0
     return spec.compile()
 
 
 class _World(DrivenWorld):
-    """The legs, with velocities as of the shorter step."""
+    """The legs, with the velocities of the shorter time step."""
 
     def message(self, state: PyTree, qpos: jax.Array, qvel: jax.Array, qacc: jax.Array) -> MjxState:
         # MuJoCo's velocities are half a step older than its positions.

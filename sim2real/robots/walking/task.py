@@ -29,12 +29,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Commands:
-    """Commands that are drawn for an episode, one after the other; after the last one the first follows.
+    """Velocities that are commanded in an episode, one after the other; after the last, the first follows.
 
     Attributes:
         most: Largest magnitudes: forwards, to the left [m/s], yaw rate [rad/s].
         every_s: How long a command lasts [s].
-        stand: Share of the commands that are 0: the robot stands still.
+        stand: Share of the commands that are 0, for which the robot stands still.
         count: Number of commands that are drawn.
         fixed: The command of all trials; None: each trial has its own.
     """
@@ -64,9 +64,9 @@ class Commands:
         return (drawn * (jax.random.uniform(k_stand, (self.count, 1)) >= self.stand)).ravel()
 
     def of_trial(self, trial: int) -> np.ndarray:
-        """Return the commands of a trial, none of them to stand still.
+        """Return the commands of a trial, none of them 0.
 
-        The same number gives the same commands, on hardware and in simulation.
+        A trial's number gives the same commands on hardware and in simulation.
         """
         if self.fixed is not None:
             return np.tile(np.array(self.fixed, np.float32), self.count)
@@ -80,7 +80,7 @@ class Commands:
 
 
 class Moment(NamedTuple):
-    """A policy step of a walking robot, from the true state after it. Vectors of the base are in its axes.
+    """The true state after a policy step of a walking robot. Vectors of the base are in its axes.
 
     Attributes:
         command: Shape ``(3,)``: forwards, to the left [m/s], yaw rate [rad/s].
@@ -92,7 +92,7 @@ class Moment(NamedTuple):
         offset: Shape ``(joints,)``: position less stance [rad].
         torque: Shape ``(joints,)`` [N m].
         last: Shape ``(joints,)``: this step's action.
-        before: Shape ``(joints,)``: the action before it.
+        before: Shape ``(joints,)``: the action of the step before.
         touches: Shape ``(feet,)``, bool.
         lands: Shape ``(feet,)``, bool: the foot landed in this step.
         swing_s: Shape ``(feet,)``: time in the air of the last swing [s].
@@ -121,14 +121,14 @@ class Moment(NamedTuple):
         """1 if a velocity is commanded, 0 if the robot has to stand still."""
         return (jnp.sum(self.command**2) > 0.01).astype(jnp.float32)
 
-    # -- measures that terms weigh
+    # -- terms of a reward
 
     def tracks(self, width: float = 0.25) -> jax.Array:
-        """Return 1 at the commanded velocity, less beside it; ``width``: squared error of 1/e [m^2/s^2]."""
+        """Return 1 at the commanded velocity, and 1/e at a squared error of ``width`` [m^2/s^2]."""
         return jnp.exp(-jnp.sum((self.command[:2] - self.linear[:2]) ** 2) / width)
 
     def turns(self, width: float = 0.25) -> jax.Array:
-        """Return 1 at the commanded yaw rate, less beside it."""
+        """Return 1 at the commanded yaw rate, and 1/e at a squared error of ``width`` [rad^2/s^2]."""
         return jnp.exp(-((self.command[2] - self.angular[2]) ** 2) / width)
 
     def action_rate(self) -> jax.Array:
@@ -136,7 +136,7 @@ class Moment(NamedTuple):
         return jnp.sum((self.last - self.before) ** 2)
 
     def steps(self, least_s: float = 0.1, most_s: float = 0.5) -> jax.Array:
-        """Return how long the feet that landed were in the air, beyond ``least_s``; 0 while standing still [s]."""
+        """Return the time in the air of feet that landed, beyond ``least_s`` [s]; 0 if no motion is commanded."""
         credit = jnp.clip(self.swing_s, 0.0, most_s) - least_s
         return self.moving * jnp.sum(jnp.where(self.lands, credit, 0.0))
 
@@ -150,15 +150,15 @@ class Moment(NamedTuple):
 
 
 _GAIT_S, _CLOSE = 0.4, 0.2
-"""A step of the gait, over which a velocity is averaged [s]; largest error of it that is a success [m/s, rad/s]."""
+"""Duration of a step of the gait, over which velocities are averaged [s]; largest error of a success [m/s, rad/s]."""
 Term = tuple[float, Callable[[Moment], jax.Array | float]]
-"""A weight, and a measure of a moment."""
+"""A term of the reward: its weight, and a function of a ``Moment``."""
 
 
 class WalkingNode(PolicyAgent):
     """Sends joint targets around the stance.
 
-    Its features are gyro, gravity, joints beside the stance, and the last action. The history has features alone.
+    Its features are gyro, gravity, joint angles minus stance, and the last action. The history repeats the features.
     """
 
     def __init__(self, robot: ComposedRobot, rate: float, **options: Unpack[NodeOptions]) -> None:
@@ -182,9 +182,9 @@ class WalkingNode(PolicyAgent):
 
 
 class WalkingTask(RobotTask):
-    """Follow velocities, without a fall.
+    """Follow commanded velocities without a fall.
 
-    The policy sees gyro, gravity, joints, last actions, and the commanded velocity.
+    The policy observes gyro, gravity, joints, last actions, and the commanded velocity.
     """
 
     units = MappingProxyType({"aim": "m/s, m/s, rad/s"})
@@ -221,7 +221,7 @@ class WalkingTask(RobotTask):
         return super().moved(start, position, velocity).replace(aim=share * start.aim)
 
     def moment(self, graph_state: GraphState) -> Moment:
-        """Return what a reward sees."""
+        """Return the state from which the rewards are computed."""
         world, agent, period_s = graph_state.state[WORLD], graph_state.state[AGENT], 1.0 / self._robot.policy_hz
         data, v = world.data, world.variables
         t_s = (graph_state.step - 1) * period_s
@@ -253,13 +253,13 @@ class WalkingTask(RobotTask):
     def score(self, t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float]:
         """Return how well a deployment went: share of the time upright, largest tilt, and errors of the velocity.
 
-        The errors are means over the time, of velocities that are averaged over a step of the gait. Encoders and IMU do
-        not measure the linear velocity: its error needs the true states of an emulated robot.
+        The errors are means over time, of velocities averaged over a step of the gait. Encoders and IMU do not measure
+        the linear velocity: its error needs the true states of an emulated robot.
         """
         turn = np.stack([states[f"quaternion[{i}]"] for i in range(4)], axis=-1)
         turn = turn / np.linalg.norm(turn, axis=-1, keepdims=True)
         upright = 1.0 - 2.0 * (turn[:, 1] ** 2 + turn[:, 2] ** 2)
-        # The commands change at policy steps, the states have times of their own.
+        # Commands change at policy steps, states have other times.
         step = ((t_s - t_s[0]) * self._robot.policy_hz + 1e-6).astype(int)
         off = []
         for name, aim in (("linear[0]", "aim[0]"), ("linear[1]", "aim[1]"), ("gyro[2]", "aim[2]")):

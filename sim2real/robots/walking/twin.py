@@ -26,7 +26,7 @@ _mj: Any = mujoco
 STEP_S = 0.002
 """Time step of the twin's physics, shorter than that of training [s]."""
 _REACH_M = 30.0
-"""Rough ground in each direction from the start: an episode's way, with pushes [m]."""
+"""Half the width of the rough ground: the length of an episode's way, with pushes [m]."""
 _SETTLED_S, _PUSHED_S = 1.0, 5.0
 """Time after a new command or a push that does not count; time from push to push [s]."""
 
@@ -35,7 +35,7 @@ class Walked(NamedTuple):
     """An episode on a twin.
 
     Attributes:
-        fell_s: When the robot fell [s]; None: it did not.
+        fell_s: When the robot fell [s]; None: it did not fall.
         error_m_s: Mean error of the forward and sideways velocity, each averaged over a step of the gait [m/s].
         error_rad_s: Mean error of the yaw rate [rad/s].
         qpos: Shape ``(N, nq)``: positions at each policy step.
@@ -50,15 +50,15 @@ class Walked(NamedTuple):
 class Twin:
     """A robot on C MuJoCo, stepped by ``advance`` from one policy step to the next.
 
-    Observations and targets take effect with the delays in ``hidden``, to the nearest physics step.
+    Observations and targets are delayed as in ``hidden``, rounded to physics steps.
 
     Args:
-        seed: Of noise, pushes and ground.
-        roughness_m: Difference between the lowest and the highest point of the ground; 0: it is the model's floor [m].
+        seed: Seed of noise, pushes and ground.
+        roughness_m: Difference between the lowest and the highest point of the ground [m]; 0: the model's floor.
 
     Attributes:
-        sent: Targets ``(joints,)`` that were sent last [rad].
-        energy_j: Integral of the power of all motors, without its sign, since the start [J].
+        sent: Last targets that were sent, ``(joints,)`` [rad].
+        energy_j: Integral of the absolute power of all motors since the start [J].
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class Twin:
             self._past.append(self._measured())
 
     def push(self, size_m_s: float) -> None:
-        """Change the base's horizontal velocity at once by a size, in a random direction [m/s]."""
+        """Change the base's horizontal velocity by ``size_m_s`` in a random direction."""
         angle = self._rng.uniform(0.0, 2.0 * np.pi)
         self.data.qvel[:2] += size_m_s * np.array([np.cos(angle), np.sin(angle)])
 
@@ -161,7 +161,7 @@ def walk(
         state, wanted[i] = after.state, decision.aim
         twin.send(decision.command)
         twin.advance(period_s)
-        # Judge by the true motion; what follows a new command or a push does not count as an error.
+        # Judge by the true motion; the time after a new command or a push does not count.
         velocity[i, :2] = into_base(twin.data.qpos[3:7], twin.data.qvel[:3])[:2]
         velocity[i, 2] = twin.data.qvel[5]
         qpos[i] = twin.data.qpos
@@ -178,15 +178,15 @@ def walk(
             break
     window = np.ones(round(0.4 * robot.drive.rate_hz)) / round(0.4 * robot.drive.rate_hz)
     error = np.stack([np.convolve(velocity[:, k] - wanted[:, k], window, "same") for k in range(3)], axis=-1)
-    error = error[settled] if settled.any() else np.full((1, 3), np.nan)  # too short to settle
+    error = error[settled] if settled.any() else np.full((1, 3), np.nan)  # the robot did not walk for long enough
     return Walked(fell_s, float(np.hypot(error[:, 0], error[:, 1]).mean()), float(np.abs(error[:, 2]).mean()), qpos)
 
 
-# -- beside a deployment
+# -- simulated episodes for comparison with a deployment
 
 
 def twin_of(robot: ComposedRobot, values: Mapping[str, float], seed: int = 0) -> Twin:
-    """Return the twin with parameters and delays by name; the policy's computation adds to the actuator's delay."""
+    """Return the twin with parameters and delays by name; the policy's computation delay adds to the actuator's."""
     joints = robot.model.joints
     hidden = HiddenTwin(
         friction=values[FRICTION],

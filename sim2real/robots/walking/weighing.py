@@ -1,8 +1,8 @@
-"""The load of a robot on its feet: the torques of its joints carry its weight.
+"""Weighs the load of a robot on its feet by the torques of its joints.
 
-Slow motions are a series of balances. With the feet in place the base has six free directions; along each of them the
-work of the joints' torques is that against gravity, and the forces on the feet do none. So the load in the base follows
-from linear equations, without the forces on the feet.
+In slow motion each posture is a static balance. With the feet in place the base has six free directions; along each of
+them the work of the joints' torques equals the work against gravity, and the forces on the feet do no work. So the load
+in the base follows from linear equations, without the forces on the feet.
 """
 
 from __future__ import annotations
@@ -27,27 +27,33 @@ from sim2real.types import MjData, MjModel
 
 _mj: Any = mujoco
 _SETTLED_S, _BEND_S = 0.5, 3.0
-"""First part of a log, which is not used, as the gains change, and shortest motion after it: in one bend down and up
-again, errors of delays and accelerations cancel [s]."""
+"""Length of the first part of a log that is not used, as gains change there; and shortest motion after it: over one
+bend down and up again, errors of delays and accelerations cancel [s].
+"""
 _UPRIGHT, _FREE = -0.95, 6
-"""Largest vertical part of gravity's direction in the base, and the directions in which the base moves."""
+"""Largest z component of gravity's direction in the base, and number of directions in which the base moves."""
 _MOVING_RAD_S, _FAST_RAD_S = 0.03, 0.6
-"""Speed at which friction has 3/4 of its size; at rest its direction is open; a speed no bending leg has [rad/s]."""
+"""Speed at which friction has 3/4 of its size, as its direction at rest is unknown; and a speed above all bending legs
+[rad/s].
+"""
 _SMOOTHED, _BLOCKS, _MOST_SAMPLES, _STEP = 5, 8, 600, 1e-4
-"""Samples of a mean speed, parts of a log that are weighed alone, used samples of a log, and step of a derivative."""
+"""Number of samples of a mean speed; parts of a log that are weighed alone; used samples of a log; step of a
+derivative.
+"""
 _WIDER = 2.365 / 1.96
-"""Factor on a standard error from 8 parts, for a 95 % interval as of a Normal distribution."""
+"""Factor on a standard error from 8 parts, to allow for their small number (Student's distribution)."""
 
 
 @dataclass(frozen=True)
 class Balances:
-    """A log as balances: the load is ``sum(rest - share . torque) / sum(size)``.
+    """Static balances of a log: the load is ``sum(rest - share . torque) / sum(size)``.
 
     Attributes:
-        law, speed, direction: Shape ``(K, joints)``: torque of the motors' law [N m], speed [rad/s], and direction of
-            the motion, between -1 and 1.
+        law, speed, direction: Shape ``(K, joints)``: commanded torque of the motors [N m], speed [rad/s], and direction
+            of the motion, between -1 and 1.
         share: Shape ``(K, joints)``: weight of each joint's torque.
-        rest, size: Shape ``(K,)``: the sum of such torques that carries the robot alone, and that for 1 kg of load.
+        rest, size: Shape ``(K,)``: the weighted sum of torques that carries the robot itself, and the sum for 1 kg of
+            load.
     """
 
     law: np.ndarray
@@ -58,7 +64,7 @@ class Balances:
     size: np.ndarray
 
     def load(self, robot: ComposedRobot, values: Mapping[str, float], part: slice = slice(None)) -> float:
-        """Return the load with which a part of the balances agrees best [kg]."""
+        """Return the load that agrees best with some of the balances [kg]."""
         joints = robot.model.joints
         damping, friction = (joints.of_group(values, name) for name in ("damping", "friction"))
         torque = joints.of_motor(values, MOTOR_STRENGTH) * self.law - damping * self.speed - friction * self.direction
@@ -71,10 +77,10 @@ def weighed(
     """Return an identification with the load, from a log of the robot on its feet.
 
     Args:
-        truth: Known parameters of the embedded robot.
+        truth: True parameters of the embedded robot.
 
     Raises:
-        OtherMotion: The load and its interval are outside of its bounds.
+        OtherMotion: The load, with its interval, is outside of its bounds.
     """
     if identification.posterior is None or not isinstance(robot, ComposedRobot):
         return identification
@@ -88,7 +94,7 @@ def weighed(
     load_of = lambda some: balances.load(robot, {**values, **some})  # noqa: E731
     posterior = _with_load(identification.posterior, load_of, scatter, (row.low, row.high))
     deviation = float(np.sqrt(posterior.covariance[-1, -1]))
-    # A load that only its error may have put outside of its bounds lies on one of them.
+    # If the load is outside of its bounds by less than its error, put it on the bound.
     require_load(load, row.low, row.high, 1.96 * deviation)
     load, left, right = np.clip(load + 1.96 * deviation * np.array([0.0, -1.0, 1.0]), row.low, row.high).tolist()
     known = row.unit, "dynamics", row.about, row.nominal, load, "ok", deviation, left, right, row.low, row.high
@@ -97,10 +103,10 @@ def weighed(
 
 
 def check(robot: object, episode: Episode, nominal: Mapping[str, float]) -> None:
-    """Refuse a log that is not of a robot on its feet, before a fit.
+    """Refuse a log of a robot that does not stand on its feet, before a fit.
 
     Args:
-        nominal: Values of the parameters, with which the load may be off by half of the robot's mass.
+        nominal: Nominal values of the parameters; with them the load may be wrong by half of the robot's mass.
     """
     if not isinstance(robot, ComposedRobot):
         raise UsageError("this robot does not stand on legs", hint="leave --standing out")
@@ -109,7 +115,7 @@ def check(robot: object, episode: Episode, nominal: Mapping[str, float]) -> None
 
 
 def require_load(load: float, low: float, high: float, error: float = 0.0) -> None:
-    """Refuse a load that is outside of bounds by more than its error [kg]."""
+    """Refuse a load that is outside of its bounds by more than its error [kg]."""
     if not low - error <= load <= high + error:
         raise OtherMotion(
             f"in the log of standing the joints carry {load:+.3g} kg beside the robot's own weight, outside of "
@@ -119,13 +125,13 @@ def require_load(load: float, low: float, high: float, error: float = 0.0) -> No
 
 
 def balances_of(robot: ComposedRobot, episode: Episode, values: Mapping[str, float]) -> Balances:
-    """Return a log as balances; refuse one in which the robot does not stand upright, or hardly moves."""
+    """Return the balances of a log; refuse a log in which the robot is not upright, or hardly moves."""
     sensed, sent = episode.outputs[SENSOR], episode.outputs[ACTUATOR]
     t_s, position = episode.steps[SENSOR].begun_s, sensed["position"].astype(np.float64)
     smooth = np.ones(_SMOOTHED) / _SMOOTHED
     speed = np.stack([np.convolve(v, smooth, "same") for v in sensed["velocity"].T.astype(np.float64)], axis=1)
     upright = np.array([gravity_of(q.astype(np.float64))[2] for q in sensed["quaternion"]])
-    used = np.flatnonzero(t_s > t_s[0] + _SETTLED_S)[: -(_SMOOTHED // 2)]  # the last mean speeds are of fewer samples
+    used = np.flatnonzero(t_s > t_s[0] + _SETTLED_S)[: -(_SMOOTHED // 2)]  # the last mean speeds have fewer samples
     if upright[used].max(initial=-1.0) > _UPRIGHT:
         raise OtherMotion("the robot does not stand upright in this log", hint="record it with --excitation standing")
     fastest = np.abs(speed[used]).max(axis=1)
@@ -161,7 +167,7 @@ def _balance(
     for i, foot in enumerate(feet):
         _mj.mj_jacSite(model, data, held[3 * i : 3 * i + 3], None, model.site(foot).id)
     free = np.linalg.svd(held)[2][-_FREE:].T
-    # The work along them against gravity, and that against 1 kg of load; errors of all torques are alike.
+    # The work along them against gravity and against 1 kg of load; all torques have equal errors.
     lifts = np.zeros((3, model.nv))
     _mj.mj_jac(model, data, lifts, None, data.xpos[base], base)
     per_kg, driven = free.T @ (lifts.T @ model.opt.gravity), free[-model.nu :]
@@ -172,7 +178,7 @@ def _balance(
 def _with_load(
     posterior: Posterior, load_of: Callable[[Mapping[str, float]], float], scatter: float, ends: tuple[float, float]
 ) -> Posterior:
-    """Return the posterior with the load, which is correlated with the parameters that it follows from.
+    """Return the posterior with the load, which is correlated with the parameters from which it follows.
 
     Args:
         load_of: Parameters -> load [kg].

@@ -41,7 +41,7 @@ QUANTITIES = {
 }
 """Quantity of a group of joints -> unit, nominal value, bounds, description."""
 ZERO_RAD = 0.015
-"""Deviation of the prior of an encoder's zero [rad]."""
+"""Standard deviation of the prior of an encoder's zero [rad]."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class JointParameters:
 
     Attributes:
         motors: Names of the joints, in the order of the motors.
-        groups: Name of a group -> numbers of its joints, which have one damping, friction and armature.
+        groups: Name of a group -> numbers of its joints, which share damping, friction and armature.
     """
 
     motors: tuple[str, ...]
@@ -67,7 +67,7 @@ class JointParameters:
         return rows + [Parameter(f"{m}_{MOTOR_STRENGTH}", "1", 1.0, 0.4, 2.0, about=about) for m in self.motors]
 
     def zeros(self) -> list[Parameter]:
-        """Return the encoders' zeros; legs in the air weigh little, so their zeros change a log little."""
+        """Return the encoders' zeros, with a prior: legs in the air weigh little, so a log hardly shows their zeros."""
         prior, about = (0.0, ZERO_RAD), "encoder at the model's zero"
         return [
             Parameter(f"{m}_zero", "rad", 0.0, -0.1, 0.1, "linear", "measurement", about, prior=prior)
@@ -80,23 +80,23 @@ class JointParameters:
         return xp.stack([xp.asarray(each[i], dtype=float) for i in range(len(self.motors))])
 
     def of_motor(self, values: Mapping[str, Scalar], quantity: str, xp: PyTree = np) -> Array:
-        """Return a quantity that each motor has of its own, ``(joints,)``."""
+        """Return a quantity that is identified for each motor, ``(joints,)``."""
         return xp.stack([xp.asarray(values[f"{motor}_{quantity}"], dtype=float) for motor in self.motors])
 
 
 _SMOOTHED_S = 0.4
-"""Time constant of the mean velocity that success is judged by: a gait sways within a step [s]."""
+"""Time constant of the mean velocity by which success is judged, as a gait sways within a step [s]."""
 
 
 class Ground(composer.Task):
-    """A robot of an MJCF file on its floor; one control step is one step of the physics.
+    """A robot on the floor of its MJCF file; one control step is one step of the physics.
 
     Args:
-        path: MJCF with a body that has the only free joint, and an actuator for each other joint.
+        path: MJCF with one free joint, and an actuator for each other joint.
         feet: Sites in the middle of the feet's spheres.
         touching_m: Height of such a site below which the foot touches the ground [m].
-        collide: Geoms that the floor sees in training; empty: all.
-        rough: Heights of the ground in place of the model's floor; None: it is flat.
+        collide: Geoms that collide with the floor in training; empty: all.
+        rough: Heights of rough ground that replaces the model's floor; None: the floor.
     """
 
     def __init__(
@@ -122,7 +122,7 @@ class Ground(composer.Task):
             floor = model.find("geom", FLOOR)
             if floor is None:
                 raise UsageError(f"{path} has no geom {FLOOR!r}, which rough ground replaces")
-            # MJCF lists the rows of heights from the last one to the first.
+            # MJCF lists the rows of heights in reverse order.
             (rows, columns), share = rough.heights.shape, rough.heights[::-1] / rough.heights.max()
             floor.type, floor.hfield = (
                 "hfield",
@@ -174,9 +174,9 @@ mj: Any = mujoco
 LOADS_KG = (-1.0, 3.0)
 """Smallest and largest load in the base [kg]."""
 _CONTACTS, _ROWS_OF_CONSTRAINTS = 16, 96
-"""Room on Warp for contacts, and for rows of constraints, in a copy."""
+"""Most contacts, and most rows of constraints, of a copy on Warp."""
 _ROWS = 9
-"""Loads that the table of models has; between them the constants are interpolated."""
+"""Number of loads for which constants are computed; between them, constants are interpolated."""
 _LOADED = ("body_mass", "body_ipos", "body_inertia", "body_subtreemass", "body_invweight0", "dof_invweight0")
 _LOADED_FIELDS = (*_LOADED, "dof_M0", "actuator_acc0")
 
@@ -184,8 +184,8 @@ _LOADED_FIELDS = (*_LOADED, "dof_M0", "actuator_acc0")
 class WalkingWorld(ComposedWorld):
     """A robot on the ground.
 
-    A load in the base changes masses, and constants that MuJoCo derives from them. A program that computes them takes
-    7 s longer to compile. So the host computes them for a few loads, and the program interpolates.
+    A load in the base changes masses, and constants that MuJoCo derives from them. A program that computes these
+    constants takes 7 s longer to compile. So the host computes them for a few loads, and the program interpolates.
     """
 
     floats = True
@@ -207,7 +207,7 @@ class WalkingWorld(ComposedWorld):
 
     def init_params(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> WorldParams:
         params = super().init_params(rng, graph_state)
-        if self._table is None:  # while it is made
+        if self._table is None:  # during the base class's constructor
             return params
         armature = jnp.asarray(self.environment.model.dof_armature[np.asarray(self._qvel)], jnp.float32)
         return params.replace(values={**params.values, PAYLOAD: jnp.float32(0.0), ARMATURE: armature})
@@ -216,7 +216,7 @@ class WalkingWorld(ComposedWorld):
         super()._set(physics, params)
         if self._table is None:
             return
-        # MuJoCo's constants that follow from an armature only condition its solver, so they stay as compiled.
+        # Constants that MuJoCo derives from an armature only condition its solver, so they stay as compiled.
         armature = physics.mjx_model.dof_armature.at[self._qvel].set(params.values[ARMATURE])
         physics.replace("model", "dof_armature", armature)
         for name, (loads, rows) in self._table.items():
@@ -230,7 +230,7 @@ class WalkingWorld(ComposedWorld):
         return BodyReading(data.qpos[self._qpos], data.qvel[self._qvel], data.qpos[3:7], data.qvel[3:6])
 
     def true_state(self, state: State) -> PyTree:
-        """Return the part of the state that a value function may observe; heights are those above the ground."""
+        """Return the part of the state that a value function may observe; heights are above the ground."""
         data, v = state.data, state.variables
         position = data.qpos[2:]
         if self._rough is not None:
@@ -247,7 +247,7 @@ class WalkingWorld(ComposedWorld):
 
 
 def load_base(model: Any, base: int, load_kg: float) -> Any:
-    """Return a copy of a model with a load in the middle of a body; MuJoCo computes what follows."""
+    """Return a copy of a model with a load in the middle of a body, and all derived constants."""
     loaded = mj.MjModel(model) if not hasattr(model, "__copy__") else model.__copy__()
     before = float(model.body_mass[base])
     loaded.body_mass[base] = before + load_kg
@@ -257,10 +257,10 @@ def load_base(model: Any, base: int, load_kg: float) -> Any:
 
 
 class WalkingModel(RobotModel):
-    """A composed task on MJX: on Warp if JAX computes on a GPU, as MJX's JAX is 20 times slower with contacts there.
+    """A walking robot on MJX; on a GPU on MuJoCo Warp, which is 20 times as fast with contacts.
 
     Args:
-        rough: Whether the robot is on its rough ground.
+        rough: Whether the robot walks on its rough ground.
     """
 
     def __init__(self, robot: ComposedRobot, rough: bool = False) -> None:
@@ -269,7 +269,7 @@ class WalkingModel(RobotModel):
 
     @cached_property
     def task(self) -> Ground:
-        """The composed task; in training the floor sees the feet alone."""
+        """The composed task; in training only the feet collide with the floor."""
         robot = self._robot
         ground = robot.terrain.growing() if self._rough else None
         return Ground(robot.mjcf, robot.feet, robot.touching_m, robot.feet, ground)
@@ -282,7 +282,7 @@ class WalkingModel(RobotModel):
         return [*self.around(), *self.joints.dynamics()]
 
     def around(self) -> list[Parameter]:
-        """Return the parameters that are of no joint: legs in the air determine none of them."""
+        """Return the parameters that belong to no joint; legs in the air determine none of them."""
         return [
             Parameter(FRICTION, "1", 0.8, 0.2, 2.0, about="friction of the feet on the ground"),
             Parameter(PAYLOAD, "kg", 0.0, *LOADS_KG, "linear", about="load in the base"),
@@ -320,7 +320,7 @@ class WalkingModel(RobotModel):
     def params(self, values: Mapping[str, Scalar], start: EpisodeStart) -> WorldParams:
         """Return the world's parameters for an episode: the base is level and at rest.
 
-        On rough ground the base starts at the place that has the roughness, above the highest bump there.
+        The parameter ``roughness`` selects a place on the rough ground; the base starts above its highest bump.
         """
         usual, joints = self._world_params.values, self.joints
         strength = jnp.asarray(values[STRENGTH], jnp.float32) * joints.of_motor(values, MOTOR_STRENGTH, jnp)
@@ -341,5 +341,5 @@ class WalkingModel(RobotModel):
 
     @cached_property
     def _world_params(self) -> WorldParams:
-        with jax.ensure_compile_time_eval():  # a cached array must not belong to the function that JAX traces now
+        with jax.ensure_compile_time_eval():  # a cached array must not be a tracer of the function that JAX traces now
             return self.make_world().init_params()
