@@ -396,8 +396,8 @@ def test_a_reader_that_has_enough_is_no_error():
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["run", "pendulum", "--train.hosts.found"], "only training is divided among processes"),
-        (["train", "pendulum", "--hosts.found", "--explain"], "explain trains nothing"),
+        (["run", "pendulum", "--train.hosts.found"], "only training can be divided among processes"),
+        (["train", "pendulum", "--hosts.found", "--explain"], "explain does not train"),
     ],
 )
 def test_what_several_processes_cannot_do_is_refused(calls, capsys, arguments, said):

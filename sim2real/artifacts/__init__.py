@@ -1,1 +1,1 @@
-"""What a stage leaves in a run folder and the next one takes: typed, versioned, hashed, with relative paths."""
+"""Files that stages write into a run folder and later stages read: typed, versioned, hashed, with relative paths."""

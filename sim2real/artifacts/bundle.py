@@ -20,9 +20,9 @@ from sim2real.types import Json
 
 BUNDLE, HISTORY = "bundle", "history.json"
 REWARD = "reward/"
-"""Prefix of the curve of a reward term."""
+"""Prefix of the names of curves of reward terms."""
 GOOD_SUCCESS = 0.9
-"""Share of success below which a policy is not good enough, in simulation and on the robot."""
+"""Smallest success of a good policy, in simulation and on the robot."""
 _AGAIN = "run `sim2real train` again"
 
 
@@ -54,7 +54,7 @@ class History:
     others: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Check the sizes of the curves, which can come from a file."""
+        """Check the sizes of the curves, because they may come from a file."""
         count = len(self.steps)
         check(count > 0, "no evaluation")
         check(self.seconds.shape == (count,), f"{self.seconds.shape} times of {count} evaluations")
@@ -86,10 +86,10 @@ class History:
 
     @staticmethod
     def load(path: Path) -> History:
-        """Read the file, or the one in the folder of a train stage.
+        """Read the file, or the file in the folder of a train stage.
 
         Raises:
-            Sim2RealError: When the file is missing or malformed.
+            Sim2RealError: The file is missing or malformed.
         """
         file = path / HISTORY if path.is_dir() else path
         with malformed(file, _AGAIN):
@@ -102,13 +102,13 @@ class Bundle(Shown):
 
     Attributes:
         contract: Observation, action, rate, and the sources of the training.
-        weights: Name -> array, as ``Policy.from_weights`` takes them.
+        weights: Name -> array; see ``Policy.from_weights``.
         history: History of the training; None if only the policy was copied.
         episodes: Distributions of the training's episodes; None if only the policy was copied.
         path: The bundle's folder; None before ``save``.
         sensitivity: Success with one wrong parameter; None if it was not simulated.
-        graph: The policy as an ONNX model if the network is a custom one; ``load`` does not read it.
-        references: Observations of log and training with JAX's actions, with which ``save`` compares the runner.
+        graph: The policy as an ONNX model, if its network is custom; ``load`` does not read it.
+        references: Observations of log and training with JAX's actions, to which ``save`` compares the runner.
         summary: Text and numbers about the training; empty for a loaded bundle.
     """
 
@@ -156,7 +156,7 @@ class Bundle(Shown):
             folder / BUNDLE, self.weights, self.contract, spec=self.spec, graph=self.graph, references=self.references
         )
         written = {"bundle": BUNDLE}
-        # Write the records of the training beside the bundle, which holds only the policy.
+        # Write the records of the training next to the bundle, which has only the policy.
         if self.history is not None:
             self.history.save(folder / HISTORY)
             written["history"] = HISTORY
@@ -172,10 +172,10 @@ class Bundle(Shown):
         """Read a policy bundle.
 
         Args:
-            path: Its folder, or that of a train stage.
+            path: The bundle's folder, or the folder of a train stage.
 
         Raises:
-            Sim2RealError: When a file is missing, damaged or of an unknown format.
+            Sim2RealError: A file is missing, damaged or of an unknown format.
         """
         path = Path(path)
         folder = path / BUNDLE if (path / BUNDLE).is_dir() else path

@@ -13,7 +13,7 @@ from sim2real.types import Json
 
 @dataclass(frozen=True)
 class ComparedRun:
-    """What one run contributes; None where its stage is not finished."""
+    """Results of one run; None for a stage that is not finished."""
 
     name: str
     started: str
@@ -29,7 +29,7 @@ class Comparison:
 
     @property
     def parameters(self) -> dict[tuple[str, str], list[Estimate | None]]:
-        """Name and unit -> each run's estimate, None if it has none; of parameters that at least two runs have."""
+        """Name and unit -> each run's estimate or None, for parameters that at least two runs have."""
         found = [run.identification.parameters if run.identification else () for run in self.runs]
         tables = [{(e.name, e.unit): e for e in estimates} for estimates in found]
         rows = {key: [table.get(key) for table in tables] for key in dict.fromkeys(k for t in tables for k in t)}
@@ -48,7 +48,7 @@ class Comparison:
         return ArtifactTable(headers, rows)
 
     def figures(self) -> ArtifactTable:
-        """Return the table of verdicts, errors and scores: one row a figure, one column a run."""
+        """Return the table of verdicts, errors and scores: a row for each figure, a column for each run."""
         columns = [_figures_of(run) for run in self.runs]
         names = dict.fromkeys(name for column in columns for name in column)
         headers = ("figure", *(run.name for run in self.runs))
@@ -56,14 +56,14 @@ class Comparison:
 
 
 def overlap(estimates: list[Estimate | None]) -> bool | None:
-    """Return whether the 95 % intervals of all runs overlap; None where fewer than two runs have one."""
+    """Return whether the 95 % intervals of all runs overlap; None if fewer than two runs have one."""
     ends = [(e.low95, e.high95) for e in estimates if e is not None]
     known = [(low, high) for low, high in ends if low is not None and high is not None]
     return max(low for low, _ in known) <= min(high for _, high in known) if len(known) > 1 else None
 
 
 def with_interval(estimate: Estimate | None) -> str:
-    """Return an estimate with the half-width of its 95 % interval; a dash where the run has none."""
+    """Return an estimate with the half-width of its 95 % interval as text; a dash if there is none."""
     if estimate is None:
         return "-"
     if estimate.low95 is None or estimate.high95 is None:

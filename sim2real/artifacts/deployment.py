@@ -1,4 +1,4 @@
-"""The artifact of deploy: a row for each episode on the robot, the tests of the model on their logs, the verdict."""
+"""The result of deploy: a row for each episode on the robot, tests of the model on the logs, and the verdict."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ RESULT, SIMULATION = "result.json", "simulation.npz"
 PROBE = "probe.mcap"
 """Log of the small steps that measure the delay before the episodes."""
 AS_HERE = "as in this log"
-"""The model with the parameters fitted to the deployment's own log."""
+"""Name of the model whose parameters were fitted to the deployment's logs."""
 _AGAIN = "run `sim2real deploy` again"
 _RUN = "{run}"
-"""Placeholder for the run's folder in the next command, as the folder may move."""
+"""Placeholder for the run's folder in the next command, because the folder may move."""
 
 
-# -- the episodes, and the same in simulation
+# -- the episodes on the robot and in simulation
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,8 @@ class EpisodeRow:
 
     Attributes:
         real: Scores on the robot: name -> value.
-        simulation: Scores of the same episode in simulation, means over its simulations; empty without any.
-        late: Node -> share of the steps that take longer than those of training.
+        simulation: Scores of the same episode in simulation, means over its simulations; empty without simulations.
+        late: Node -> share of the steps that take longer than in training.
         paused_s: Time that the slowest node lost in steps of two periods or more [s].
     """
 
@@ -66,7 +66,7 @@ class Gap:
 
     @property
     def gap(self) -> float | None:
-        """The robot's value less that in simulation."""
+        """The robot's value minus the value in simulation."""
         return None if self.real is None or self.simulation is None else self.real - self.simulation
 
 
@@ -74,22 +74,22 @@ class Gap:
 
 
 _MIN_SHARE = 0.5
-"""A change can be the cause if it explains this share of the error that the best change explains."""
+"""A change may be the cause if it explains at least this share of what the best change explains."""
 _MAX_CHANCE = 0.1
 """A single change is reported as likely if its probability by chance is lower."""
 
 
 @dataclass(frozen=True)
 class Changed:
-    """A possible change of a robot: of a parameter, of the sum of the delays, or of a cause of several changes.
+    """A possible change of a robot: of a parameter, of the sum of the delays, or of a cause that changes several.
 
     Attributes:
-        unit: Unit of ``before`` and ``now``; "" for a cause, as they are factors.
+        unit: Unit of ``before`` and ``now``; "" for a cause, for which they are factors.
         before: The estimate.
-        now: The value that fits the later log best if only this has changed.
+        now: The value that fits the later log best if nothing else has changed.
         low95: Lower end of the 95 % interval of ``now``; it includes the uncertainty of the estimate.
         explains: Share of the error that the change removes, beyond the uncertainty of the estimate.
-        p: Probability of such a share by chance, or by a factor below 1/20; not corrected for several tests.
+        p: Probability of such a share by chance; not corrected for several tests.
     """
 
     name: str
@@ -127,10 +127,10 @@ class Drift:
 
     @property
     def named(self) -> Changed | None:
-        """The smallest ``p`` of the significant changes that explain much; None without alarm.
+        """The change with the smallest ``p``, of the significant changes that explain much; None without an alarm.
 
-        The largest ``explains`` can belong to another parameter: if the model lacks a part of the friction, more
-        friction explains some error of every motion.
+        The largest ``explains`` may belong to another parameter: if the model lacks a part of the friction, more
+        friction explains some of the error of every motion.
         """
         significant = [c for c in self.changes if c.name in self.alarms]
         largest = max((c.explains for c in significant), default=0.0)
@@ -154,7 +154,7 @@ class Drift:
                 c.now,
                 Interval(c.low95, c.high95),
                 c.unit or "factor",
-                f"{100 * c.explains:.1f} %",  # a text: the number is not in the row's unit
+                f"{100 * c.explains:.1f} %",  # as text, because the number is not in the row's unit
                 c.name in self.alarms,
             ]
             for c in self.changes
@@ -166,7 +166,7 @@ class Drift:
 
 
 class Finding(StrEnum):
-    """What a verdict rests on; ``Deployment.sentence`` has the words."""
+    """Reasons of a verdict; ``Deployment.sentence`` has their texts."""
 
     SUCCESS = "success"
     LATE = "late steps"
@@ -186,7 +186,7 @@ Status: TypeAlias = Literal["fine", "re-identify", "re-train", "look at this joi
 
 @dataclass(frozen=True)
 class Reason:
-    """A finding, and what it is about: a joint, a node, a parameter, or why the model is not tested."""
+    """A finding, and its subject: a joint, a node, a parameter, or why the model was not tested."""
 
     finding: Finding
     about: str = ""
@@ -197,11 +197,11 @@ class Verdict:
     """The verdict on a deployment.
 
     Attributes:
-        reasons: The one that decides first.
+        reasons: The reasons; the first one decided.
         stages: The stages to run next; empty if none helps, or none is needed.
-        terms: The optional terms to identify with next: those of the identification, and that of the parameter that
-            changed, without which the model bends its other parameters; "" without an identification.
-        next: The command to type; "" if none is needed.
+        terms: The optional terms to identify with next: those of the identification, and the term of the parameter that
+            changed, without which other estimates would be wrong; "" without an identification.
+        next: The next command; "" if none is needed.
     """
 
     status: Status
@@ -217,14 +217,14 @@ class Deployment(Shown):
 
     Attributes:
         measured_delay: The delay before the episodes, as a text; "" if it was not measured.
-        replay: Error of the identified model on the recorded commands, for each measured position; beside it those of
-            the nominal model, and of the model with the parameters fitted to these logs, ``AS_HERE``.
+        replay: Error of the identified model on the recorded commands, for each measured position; with the errors of
+            the nominal model, and of the model ``AS_HERE``, whose parameters were fitted to these logs.
         drift: Test for parameters that have changed since the identification; None if it did not run.
-        untested: Why the model is not tested on these logs; None if it is.
+        untested: Why the model was not tested on these logs; None if it was.
         verdict: None after a dry run.
         dry_run: Whether commands were not sent: then there are no scores, no simulation and no gap.
-        simulated: Columns of each episode's simulation: ``t`` [s] and a field's values ``(N,)``; a field with its own
-            times has them as ``t_FIELD``. Empty without a simulation.
+        simulated: Columns of each episode's simulation: ``t`` [s] and values ``(N,)`` of each field; a field with other
+            times has ``t_FIELD``. Empty without a simulation.
         probe: Log of the small steps that measure the delay; None if the delay was not measured.
     """
 
@@ -255,7 +255,7 @@ class Deployment(Shown):
         return Gap(name, real, mean([e.simulation.get(name) for e in self.episodes]))
 
     def late_share(self, node: str) -> float:
-        """Return the share of a node's steps that take longer than those of training, over all episodes."""
+        """Return the share of a node's steps that take longer than in training, over all episodes."""
         return mean([e.late.get(node) for e in self.episodes]) or 0.0
 
     @property
@@ -263,7 +263,7 @@ class Deployment(Shown):
         """The logs of this deployment: its episodes, then the small steps before them."""
         return self.recordings if self.probe is None else (*self.recordings, self.probe)
 
-    # What pages and the console show.
+    # -- for pages and the console
 
     def about(self) -> Mapping[str, Json]:
         """Return episodes, verdict, reasons and the next command, by name."""
@@ -314,12 +314,12 @@ class Deployment(Shown):
                 return about
 
     def rows(self) -> ArtifactTable:
-        """Return the gap: a row for each score."""
+        """Return a row for each score, on the robot and in simulation."""
         words = [words_and_unit(g.quantity) for g in self.gap]
         rows = [[name, g.real, g.simulation, g.gap, unit] for g, (name, unit) in zip(self.gap, words, strict=True)]
         return ArtifactTable(("quantity", "robot", "simulation", "gap", "unit"), rows)
 
-    # The files.
+    # -- files
 
     def save(self, folder: Path | str) -> dict[str, str]:
         """Write the rows, the verdict and the simulation into a folder; the logs are in it already.
@@ -379,7 +379,7 @@ def as_here(row: ComparedError) -> ComparedError:
 
 
 def mean(values: Sequence[float | None]) -> float | None:
-    """Return the mean of the values that exist; None if none does."""
+    """Return the mean of the values that are not None; None without such values."""
     present = [v for v in values if v is not None]
     return float(np.mean(present)) if present else None
 

@@ -25,7 +25,7 @@ class Varied:
     Attributes:
         value: The estimate, or the nominal value.
         low95: Lower end of the estimate's 95 % interval; None without an interval.
-        open: Whether the recordings do not determine it; it is then drawn from its bounds.
+        open: Whether the recordings do not determine it, so that it is drawn from its bounds.
     """
 
     name: str
@@ -42,13 +42,13 @@ class Episodes:
 
     Attributes:
         parameters: Parameters that differ between episodes, with pushes and starts, in the order of the table.
-        widening: Factor on the posterior's deviations that covers errors of the model.
-        cut: Number of timelines that end before a pause that the program cannot hold.
-        again: Number of timelines that were drawn again, as such a pause was in their first half.
+        widening: Factor on the posterior's standard deviations that covers errors of the model.
+        cut: Number of timelines that were cut before a pause that is too long for the program.
+        again: Number of timelines that were drawn again, because such a pause was in their first half.
         longest_pause_s: Longest time between two policy steps [s].
         push_hz: Pushes of each joint per second [Hz]; 0 for none.
         curriculum: Share of all differences between episodes at the first and at the last update.
-        follow: Success of the training's episodes above which this share grows; 0: it grows with the updates.
+        follow: Success in training above which ``curriculum`` grows; 0: it grows with the updates.
         draws: Parameter -> drawn values ``(K,)``.
         drawn_s: Node -> durations of its steps in the timelines ``(M,)`` [s].
     """

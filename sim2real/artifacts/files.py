@@ -22,17 +22,17 @@ from sim2real.types import Json
 if TYPE_CHECKING:
     import numpy as np
 else:
-    np = Later("numpy")  # a manifest, which `--help` of a stage reads, has no arrays
+    np = Later("numpy")  # imported late: a manifest, which `--help` of a stage reads, has no arrays
 
 T = TypeVar("T")
 
 _FOREIGN = (ValueError, KeyError, TypeError, AttributeError, IndexError, OSError)
-"""Exceptions of reading a malformed file."""
+"""Exceptions that a malformed file may cause."""
 
 
 @contextmanager
 def malformed(path: Path, again: str) -> Iterator[None]:
-    """Turn the exceptions of reading a malformed file into an error that names the file.
+    """Convert the exceptions that a malformed file causes to an error that names the file.
 
     Args:
         again: The hint of the error, such as the command that makes the file again.
@@ -95,10 +95,10 @@ def write_json(path: Path, document: object, without: Collection[str] = ()) -> N
 
     Args:
         document: A dataclass, or a dict of its fields; infinite numbers and NaN, which JSON lacks, become null.
-        without: Names of fields of a dataclass that lie in other files.
+        without: Names of fields of a dataclass that are stored in other files.
 
     Raises:
-        Sim2RealError: When a text has bytes that are no text, which names of files can have.
+        Sim2RealError: A text is not valid Unicode, as names of files may be.
     """
     if without:
         document = {n: v for n, v in vars(document).items() if n not in without}
@@ -109,10 +109,10 @@ def write_json(path: Path, document: object, without: Collection[str] = ()) -> N
 
 @contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
-    """Yield a stream whose bytes replace a file when the block ends, on the disk and at once; an error leaves it."""
+    """Yield a stream whose bytes replace a file atomically when the block ends; after an error the file stays."""
     draft = path.with_name(f".{path.name}.tmp")
     try:
-        # Overwrite what is there, then cut the file to its length: reserved bytes need no new space on a full disk.
+        # Overwrite reserved bytes, which needs no new space on a full disk, then cut the file to its length.
         with os.fdopen(os.open(draft, os.O_WRONLY | os.O_CREAT, 0o666), "wb") as stream:
             yield stream
             stream.truncate()
@@ -128,8 +128,8 @@ def to_json(document: object) -> bytes:
     """Return a document as JSON: dataclasses as objects, arrays as lists, infinite numbers and NaN as null.
 
     Raises:
-        TypeError: When a value has no form in JSON.
-        Sim2RealError: When a text has bytes that are no text.
+        TypeError: A value has no form in JSON.
+        Sim2RealError: A text is not valid Unicode.
     """
     try:
         return msgspec.json.format(msgspec.json.encode(document, enc_hook=_encoded), indent=1)
@@ -138,7 +138,7 @@ def to_json(document: object) -> bytes:
 
 
 def plain(value: object) -> Json:
-    """Return a value as the dicts, lists, texts, numbers and null that a JSON file of it has; see ``to_json``."""
+    """Return a value as dicts, lists, texts, numbers and None, like a JSON file; see ``to_json``."""
     return msgspec.json.decode(to_json(value))
 
 
@@ -148,7 +148,7 @@ def _numbers(kind: Any, value: Json) -> Json:
     # A null in the place of a number is NaN.
     if kind is float:
         return math.nan if value is None else value
-    # Of a union, take the first type that can hold the value.
+    # For a union, take the first type that can hold the value.
     if isinstance(kind, UnionType) or get_origin(kind) is Union:
         fitting = [k for k in inner if k is not NoneType and (k is float) != isinstance(value, dict | list)]
         return value if value is None or not fitting else _numbers(fitting[0], value)
@@ -182,7 +182,7 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     """Write arrays to a compressed npz file; a reader finds the old file or the new one, never a part.
 
     Raises:
-        Sim2RealError: When a name has a null character, at which a zip file cuts it off.
+        Sim2RealError: A name has a null character, at which a zip file would cut it off.
     """
     if invalid := [name for name in arrays if "\0" in name]:
         raise Sim2RealError(f"{path} cannot be written: the name {invalid[0]!r} has a null character")
@@ -209,10 +209,10 @@ def write_grouped(path: Path, document: object, kinds: Sequence[str]) -> None:
 
 
 def read_grouped(path: Path, kinds: Sequence[str]) -> dict[str, dict[str, np.ndarray]]:
-    """Return what ``write_grouped`` wrote: field -> name -> numbers ``(N,)``.
+    """Read a file of ``write_grouped``: field -> name -> numbers ``(N,)``.
 
     Raises:
-        ValueError: When it is no such file.
+        ValueError: The file has another content.
     """
     groups: dict[str, dict[str, np.ndarray]] = {kind: {} for kind in kinds}
     for name, values in read_arrays(path).items():
@@ -228,7 +228,7 @@ def number(value: float | None, missing: float = math.nan) -> float:
 
 
 def _encoded(value: object) -> Json:
-    """Return a value that is not of JSON's types as one that is: paths as texts, arrays as lists."""
+    """Convert a value to a type that JSON has: paths to texts, arrays to lists."""
     if isinstance(value, os.PathLike):
         return os.fspath(value)
     if isinstance(value, Integral | Real):

@@ -1,4 +1,4 @@
-"""The artifact of identify: ``parameters.json``, predictions, free runs, and the timing of the recording."""
+"""The result of identify: ``parameters.json``, predictions, free runs, and the timing of the recording."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ _RUN = "{run}"
 
 @dataclass(frozen=True)
 class Estimate:
-    """One identified parameter; a number is None if it does not apply, is infinite or unknown.
+    """One identified parameter; a number is None if it does not exist, is infinite or unknown.
 
     Attributes:
-        name: Its name.
+        name: Name of the parameter.
         kind: Kind of the parameter; the round trip is ``derived`` from the delays.
         nominal: The data sheet's value.
         low95: Lower end of the 95 % interval.
@@ -72,7 +72,7 @@ class Estimate:
 
     @property
     def absent(self) -> bool:
-        """Whether it is a limit that the model does not have, as no motion reaches one; tables omit it."""
+        """Whether it is a limit that the model lacks, because no motion reaches it; tables omit it."""
         return self.state == "fixed" and self.estimate == self.nominal == _NO_LIMIT
 
 
@@ -103,13 +103,13 @@ _FIELD = re.compile(r"(.+?)(?:\[(\d+)\])?")
 
 @dataclass(frozen=True)
 class Noise:
-    """The differences between one measured quantity and the identified model.
+    """The noise of one measured quantity.
 
     Attributes:
         field: A field of the sensor's message, with an index ``[i]`` if the field is a vector.
-        deviation: Standard deviation of the part that changes from sample to sample; includes jitter of sampling times.
+        deviation: Standard deviation of noise from sample to sample; includes jitter of sampling times.
         resolution: Step between neighbouring readings; 0 if readings have no step.
-        offset: Standard deviation of the part that is constant over a segment.
+        offset: Standard deviation of an error that is constant over a segment.
     """
 
     field: str
@@ -119,7 +119,7 @@ class Noise:
     offset: float
 
     def __post_init__(self) -> None:
-        """Check the numbers, which can come from a file."""
+        """Check the numbers, because they may come from a file."""
         sizes = (self.deviation, self.resolution, self.offset)
         check(all(math.isfinite(s) and s >= 0.0 for s in sizes), f"{self.field}: noise of {sizes}")
 
@@ -136,8 +136,8 @@ class Term:
 
     Attributes:
         used: Whether the model has it.
-        gain: By which share it lowers the errors on held-out parts, beside the other used terms; negative if it harms;
-            None if it was not tried.
+        gain: By which share it lowers the errors on held-out parts, together with the other used terms; negative if it
+            harms; None if it was not tried.
     """
 
     name: str
@@ -156,8 +156,8 @@ class OverLogs:
     """The mean of the estimates of one parameter from each log alone.
 
     Attributes:
-        standard_error: Of the mean.
-        spread: Deviation between logs, beyond their standard errors.
+        standard_error: Standard error of the mean.
+        spread: Standard deviation between logs, in addition to their standard errors.
         low95: Lower end of the 95 % interval for a further log.
     """
 
@@ -171,7 +171,7 @@ class OverLogs:
 
 
 WITHOUT_DELAYS, STANDING_STILL, GOAL = "without delays", "standing still", "goal"
-"""Baselines beside the nominal model: the model fitted without delays, the last measurement, and the joint's goal."""
+"""Further baselines: the model fitted without delays, the last measurement, and the joint's goal."""
 
 
 @dataclass(frozen=True)
@@ -179,9 +179,9 @@ class ExpectedError:
     """The error to expect of a joint on later data: 1.25 times its worst error on held-out parts.
 
     Attributes:
-        seconds: How far ahead it is predicted, or the length of the free run [s].
-        error: Root mean square, for motion like the fitted one.
-        free_run: Whether all of it is one prediction; else windows are predicted, each from a state of its own.
+        seconds: Horizon of the prediction, or length of the free run [s].
+        error: Root mean square error, for motion like the fitted one.
+        free_run: Whether the log is predicted from one state; otherwise in windows, each from its own state.
     """
 
     joint: str
@@ -192,7 +192,7 @@ class ExpectedError:
 
     @property
     def how(self) -> str:
-        """How far ahead it is predicted, or the free run, as text."""
+        """The horizon, or the free run, as text."""
         return _how(self.seconds, self.free_run)
 
 
@@ -202,11 +202,11 @@ def _how(seconds: float, free_run: bool) -> str:
 
 @dataclass(frozen=True)
 class ComparedError:
-    """The error of a joint on data that was not fitted, beside the expected error and those of baselines.
+    """The error of a joint on data that was not fitted, with the expected error and the errors of baselines.
 
     Attributes:
         log: The predicted log; "": all held-out parts together.
-        seconds: How far ahead it is predicted, or the length of the free run [s].
+        seconds: Horizon of the prediction, or length of the free run [s].
         error: Root mean square error; None if the model diverges.
         expected: The expected error, larger for a motion that is faster or goes further than the fitted one; None if
             there were too few held-out parts.
@@ -228,7 +228,7 @@ class ComparedError:
 
     @property
     def ratio(self) -> float | None:
-        """The error over the expected error; None without one."""
+        """The error divided by the expected error; None without an expected error."""
         return None if self.expected is None else math.inf if self.error is None else self.error / self.expected
 
     @property
@@ -254,7 +254,7 @@ class ComparedError:
 
 
 def compared_table(rows: Sequence[ComparedError]) -> ArtifactTable:
-    """Return a row for each error, with those of the baselines if there are some."""
+    """Return a row for each error, with the errors of the baselines if there are any."""
     models = list(dict.fromkeys(model for row in rows for model in row.baselines))
     cells = [
         [
@@ -269,23 +269,23 @@ def compared_table(rows: Sequence[ComparedError]) -> ArtifactTable:
 
 _WINDOW_S = 1.0
 _UNEXPLAINED = 0.5
-"""Share of a joint's motion from which an error means that the model does not explain the second."""
+"""The model does not explain a second if its error is at least this share of the joint's motion."""
 _SMALLER = {"rad": "mrad", "m": "mm", "s": "ms"}
-"""Unit -> a thousandth of it, for errors below 1."""
+"""Unit -> its thousandth, for errors below 1."""
 
 
 @dataclass(frozen=True)
 class WorstSecond:
-    """The worst second of the joint that the identified model explains worst.
+    """The second in which the identified model predicts a joint worst.
 
     Attributes:
         field: The joint's field among the columns of the samples.
         log: The name of the log.
         begin_s: Start of the second in the log [s].
-        end_s: Its end [s]; a shorter segment has a shorter one.
-        error: Root mean square of the residual in it; None if the model diverges.
-        share_of_motion: The same as a share of the motion, the deviation of all measured positions of the joint in the
-            log; None if the model diverges.
+        end_s: End of the second in the log [s]; in a short segment it is shorter.
+        error: Root mean square error in the second; None if the model diverges.
+        share_of_motion: The error divided by the standard deviation of the joint's positions in the log; None if the
+            model diverges.
     """
 
     joint: str
@@ -309,7 +309,7 @@ class WorstSecond:
 
 
 def with_small_unit(value: float, unit: str) -> str:
-    """Return an error with its unit, below 1 rad, m or s in thousandths."""
+    """Return an error with its unit; below 1 rad, m or s in mrad, mm or ms."""
     if unit in _SMALLER and abs(value) < 1.0:
         value, unit = 1e3 * value, _SMALLER[unit]
     return f"{value:.{max(2, len(str(int(abs(value)))))}g} {unit}".rstrip()
@@ -349,11 +349,11 @@ class Link:
     """The delay of a link, estimated from the motion.
 
     Attributes:
-        name: The delay's parameter; or delays joined by ``+``, as a log of motion determines only their sum.
-        mean: Mean in the middle of a log [s].
+        name: Name of the delay's parameter; or names joined by ``+``, as a log determines only the sum.
+        mean: Mean delay [s].
         deviation: Standard deviation [s].
         p95: 95th percentile [s].
-        lost: Share of lost messages: their reader uses the previous message again.
+        lost: Share of lost messages, in whose place the reader uses the previous message again.
         delays: Shape ``(K,)``: values [s].
         share: Shape ``(K,)``: share of the messages with each of these values.
     """
@@ -386,7 +386,7 @@ def links_table(links: Sequence[Link]) -> ArtifactTable:
 
 @dataclass(frozen=True)
 class Internal:
-    """What later stages need to predict with an identification.
+    """Numbers with which later stages predict.
 
     Attributes:
         motion: Joint -> lowest and highest position, and largest speed, in the fitted segments.
@@ -405,11 +405,11 @@ class Identification(Shown):
 
     Attributes:
         logs: The fitted logs, then the logs that are held out whole.
-        errors: Errors of each joint on held-out parts: on all of them together, beside baselines, up to each of several
-            horizons, the worst joint first; then of each log, ahead and in a free run, beside the expected errors.
+        errors: Errors of each joint on held-out parts: first on all parts together, with baselines, up to each of
+            several horizons, the worst joint first; then on each log, ahead and in a free run, with expected errors.
         expected_error: The error to expect of each joint on later data, ahead and in a free run; the joint with the
-            largest one beside its noise comes first.
-        worst: The second in which the model explains a joint worst; None without samples.
+            largest error relative to its noise comes first.
+        worst: The worst second; None without samples.
         over_logs: Parameters estimated from each of several logs alone; empty for one log.
         terms: The optional terms that the model has, or that were tried; None if there are none.
         noise: Noise of the sensor.
@@ -458,9 +458,9 @@ class Identification(Shown):
         return {name: value for name, value in facts.items() if value}
 
     def rows(self) -> ArtifactTable:
-        """Return a row for each parameter; of the delays their sum alone, which is what a log determines.
+        """Return a row for each parameter; for the delays only their sum, which a log determines.
 
-        Only an embedded robot has the columns of the truth.
+        Only for an embedded robot there are columns with the truth.
         """
         summed = any(p.name == ROUND_TRIP for p in self.parameters)
         known = any(p.truth is not None for p in self.parameters)
@@ -485,7 +485,7 @@ class Identification(Shown):
     def held_out(self) -> tuple[ComparedError, ...]:
         """The errors on all held-out parts up to the longest horizon, the worst joint first.
 
-        Joints for which a baseline is as good come first, then those with the largest error beside the expected one.
+        Joints for which a baseline is as good come first, then the others by the ratio of error to expected error.
         """
         rows = [e for e in self.errors if not e.log]
         longest_s = max((e.seconds for e in rows), default=0.0)
@@ -494,12 +494,12 @@ class Identification(Shown):
 
     @property
     def judged(self) -> tuple[ComparedError, ...]:
-        """The errors beside an expected one, the largest ratio first; then those beside baselines alone."""
+        """The errors with an expected error, the largest ratio first; then errors with baselines only."""
         compared = sorted((e for e in self.errors if e.ratio is not None), key=lambda e: -(e.ratio or 0.0))
         return (*compared, *(e for e in self.held_out if e.ratio is None))
 
     def outlook(self) -> str:
-        """Return the expected errors of the joint with the largest one beside its noise, as text."""
+        """Return the expected errors of the joint whose expected error is largest relative to its noise, as text."""
         if not self.expected_error:
             return "unknown, as there are too few held-out parts, or a prediction of one diverged"
         first, joints = self.expected_error[0], {e.joint for e in self.expected_error}
@@ -520,10 +520,10 @@ class Identification(Shown):
         """Return the posterior.
 
         Args:
-            hint: Of the error, where the verdict has no next command.
+            hint: Hint of the error, if the verdict has no next command.
 
         Raises:
-            Sim2RealError: The fit did not finish, so there is none.
+            Sim2RealError: The fit did not finish, so there is no posterior.
         """
         if self.posterior is None:
             ended = "did not finish" if self.verdict.status == "not finished" else "has no intervals"
@@ -539,7 +539,7 @@ class Identification(Shown):
 
     @property
     def intervals(self) -> dict[str, tuple[float | None, float | None]]:
-        """Parameter -> its 95 % interval; None where it is unknown."""
+        """Parameter -> its 95 % interval; None at an unknown end."""
         return {p.name: (p.low95, p.high95) for p in self.parameters}
 
     @property
@@ -603,7 +603,7 @@ class Identification(Shown):
             check(all(np.isfinite(p.estimate) for p in identification.parameters), "an estimate is no number")
         following = identification.verdict.next.replace(_RUN, shown(file.parent.parent))
         identification = replace(identification, verdict=replace(identification.verdict, next=following))
-        # Files beside it may be missing: a copy of the estimates alone can be read.
+        # The other files may be missing, so that a copy of the estimates alone can be read.
         others: dict[str, Json] = {}
         if file.with_name(TIMING).is_file():
             others["timing"] = Timing.load(file.with_name(TIMING))
@@ -615,14 +615,14 @@ class Identification(Shown):
 
 
 def _from_truth(p: Estimate) -> str:
-    """Return how far an estimate is from the truth, as a share of it; in its unit if the truth is 0."""
+    """Return how far an estimate is from the truth, in percent; in its unit if the truth is 0."""
     if p.truth is None:
         return ""
     return f"{100 * (p.estimate - p.truth) / abs(p.truth):+.1f} %" if p.truth else f"{p.estimate:+.2g} {p.unit}"
 
 
 def _columns(samples: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the columns; each must have one value a sample, and at least one sample."""
+    """Return the columns after checking that all have the same number of values, at least one."""
     missing = set(_COLUMNS) - set(samples)
     check(not missing, f"no {', '.join(sorted(missing))}")
     wrong = [n for n, v in samples.items() if v.ndim != 1 or v.shape != samples["t"].shape]

@@ -14,11 +14,11 @@ from sim2real.errors import DelayChanged
 
 @dataclass(frozen=True)
 class Iteration:
-    """One time around the loop; it ends with a deployment.
+    """One iteration, which ends with a deployment.
 
     Attributes:
         stages: Folders of the stages that ran, in order, relative to the run.
-        deployment: The deployment's folder; it is not finished if the policy was refused.
+        deployment: The deployment's folder; unfinished if the policy was refused.
         real: Mean success of the episodes on the robot; None if the task has no success.
         simulation: Mean success in simulation.
         verdict: Verdict of the deployment; ``re-identify`` if the policy was refused.
@@ -34,7 +34,7 @@ class Iteration:
 
     @property
     def refused(self) -> bool:
-        """Whether the policy was refused, as the robot's delay has changed."""
+        """Whether the policy was refused because the robot's delay has changed."""
         return not self.deployment.finished
 
 

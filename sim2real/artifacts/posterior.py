@@ -1,4 +1,4 @@
-"""The posterior, from which training draws: estimate, covariance, and other models that fit the recordings."""
+"""The posterior, from which training draws robots: estimate and covariance."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ if TYPE_CHECKING:
 
 Transform = Literal["linear", "log"]
 TRANSFORMS = {
-    # value -> scale (numpy); scale -> value (numpy or JAX); d value / d scale, as a function of the value
+    # each scale: value -> scale (numpy); scale -> value (numpy or JAX); d value / d scale as a function of the value
     "linear": (lambda v: v, lambda x, m: x, lambda v: 1.0 + 0.0 * v),
     "log": (np.log, lambda x, m: m.exp(x), lambda v: v),
 }
-"""Scales of the search; on its scale, the uncertainty of a parameter is Normal."""
+"""Scales of the search; on its scale, a parameter is assumed to be normally distributed."""
 
 
 def from_scale(transform: str, x: Any, numpy: ModuleType = np) -> Any:
@@ -35,15 +35,15 @@ class Posterior:
     """A Normal distribution on the parameters' scales, folded back at their bounds.
 
     Attributes:
-        names: Names of P parameters; ``NAME@recording`` if each recording has a value of its own.
+        names: Names of P parameters; ``NAME@recording`` if each recording has its own value.
         transform: Scale of each parameter.
         mean: Shape ``(P,)``, on the scales.
         covariance: Shape ``(P, P)``, on the scales.
         lower: Shape ``(P,)``: lower bounds on the scales.
-        widening: Factor on the deviations with which draws cover the errors of the model.
+        widening: Factor on the standard deviations, so that draws cover the errors of the model.
 
     Raises:
-        ValueError: When the sizes differ, or an entry is no number.
+        ValueError: The sizes differ, or an entry is no number.
     """
 
     names: tuple[str, ...]
@@ -55,7 +55,7 @@ class Posterior:
     widening: float = 1.0
 
     def __post_init__(self) -> None:
-        """Check the distribution, which can come from a file."""
+        """Check the distribution, because it may come from a file."""
         size = len(self.names)
         shapes = {a.shape for a in (self.mean, self.lower, self.upper)}
         fits = shapes == {(size,)} and self.covariance.shape == (size, size) and len(self.transform) == size

@@ -41,7 +41,7 @@ class Recording(Shown):
 
     @staticmethod
     def load(path: Path | str, truth: Path | None = None) -> Recording:
-        """Read a log; a log that was cut is read up to the cut.
+        """Read a log; a truncated log is read up to its end.
 
         Args:
             path: The log, or the folder of a record stage.
@@ -70,7 +70,7 @@ class Recording(Shown):
 
     @property
     def dry_run(self) -> bool:
-        """Whether the commands were computed and not sent."""
+        """Whether commands were computed but not sent."""
         return self.episode.metadata.get("dry_run") is True
 
     @property
@@ -79,11 +79,11 @@ class Recording(Shown):
         pairs = {pair for fields in self.episode.units.values() for pair in fields.items()}
         fields = [field for field, _ in pairs]
         unique = {field: unit for field, unit in sorted(pairs) if fields.count(field) == 1}
-        return {**self.episode.metadata.get("units", {}), **unique}  # older logs: units are the session's
+        return {**self.episode.metadata.get("units", {}), **unique}  # older logs have units in the session's metadata
 
     @property
     def summary(self) -> Mapping[str, Json]:
-        """What the session wrote at its end: timing by node, losses, the gate's counts; empty after a crash."""
+        """Summary at the session's end: timing by node, losses, the gate's counts; empty after a crash."""
         return self.episode.metadata.get("log", {}).get("session_end") or {}
 
     def about(self) -> Mapping[str, Json]:
@@ -108,14 +108,14 @@ class Recording(Shown):
         Raises:
             Sim2RealError: When its file is damaged.
         """
-        from sim2real.emulation.truth import read_truth  # training reads recordings without hardware
+        from sim2real.emulation.truth import read_truth  # imported late: training reads recordings without hardware
 
         return None if self.truth_path is None else read_truth(self.truth_path)
 
     def true_states(self) -> tuple[np.ndarray, dict[str, np.ndarray]] | None:
         """Return times ``(N,)`` [s] since the session's start and true states ``(N,)`` by name, within the session.
 
-        None for a robot that is not embedded, and for a log without the start of its clock.
+        None for a robot that is not embedded, or if the log lacks the start of its clock.
         """
         if self.truth is None or "monotonic_ns" not in self.summary:
             return None

@@ -1,7 +1,7 @@
 """Run folders: ``runs/<pipeline>/<time>/{record,identify,train,deploy}/``, each with a ``manifest.json``.
 
-A repeated stage in the same run folder gets ``<stage>.2``, ``<stage>.3``, ...: the process that writes into a folder
-creates it, and the folder is never renamed. So two processes never write into the same folder, files are never
+A repeated stage in the same run folder gets ``<stage>.2``, ``<stage>.3``, ...; each process creates the folder into
+which it writes, and folders are never renamed. So two processes never write into the same folder, files are never
 overwritten, references to files stay valid, and a failed attempt does not hide a finished one.
 
 A manifest has a stage's inputs, configuration, outputs and status, and is replaced atomically. A lock on it shows
@@ -39,17 +39,17 @@ except ImportError:  # Windows
 
 STAGES = ("record", "identify", "train", "deploy")
 TAKES = {"identify": ("record", "log"), "train": ("identify", "parameters"), "deploy": ("train", "bundle")}
-"""Stage -> the stage before it, and the output of that stage that it reads."""
+"""Stage -> the stage before it, and which output of that stage it reads."""
 MANIFEST = "manifest.json"
 RUNNING, FINISHED, FAILED, INTERRUPTED = "running", "finished", "failed", "interrupted"
 DRY = "dry run"
-"""Status of a finished stage that sent no commands: later stages do not use it."""
+"""Status of a finished stage that sent no commands, and that later stages therefore ignore."""
 DIED = "died"
 """Status of a stage whose process ended without writing its end: it was killed, or the machine lost its power."""
 SIGINT_CODE = 130
 PACKAGES = ("sim2real", "jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "flax", "optax", "evosax", "mcap")
 _RESERVED_BYTES = 32 * 1024
-"""Most manifests have 4 kB; manifests with long summaries are larger."""
+"""Reserved size of a manifest [bytes]: most have 4 kB."""
 _NAME = re.compile(r"\w[\w.-]*")
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _LOCKED_OR_NO_LOCKS = (errno.EAGAIN, errno.EACCES, errno.ENOTSUP, errno.ENOSYS, errno.ENOLCK, errno.EINVAL)
@@ -57,7 +57,7 @@ _LOCKED_OR_NO_LOCKS = (errno.EAGAIN, errno.EACCES, errno.ENOTSUP, errno.ENOSYS, 
 
 @dataclass(frozen=True)
 class Source:
-    """A file and its SHA-256, "" without a file. Paths are relative to the run folder, an output's to its stage's."""
+    """A file and its SHA-256 ("" without a file). Paths are relative to the run folder; outputs, to the stage's."""
 
     path: str
     sha256: str
@@ -72,7 +72,7 @@ class Manifest:
         started: Time in UTC.
         command: The command line.
         config: The resolved configuration.
-        git: Commit of the repository that holds the working directory, and whether tracked files differ from it.
+        git: Commit of the repository of the working directory, and whether tracked files differ from it.
         error: Why the stage failed.
     """
 
@@ -140,7 +140,7 @@ class StageFolder:
         return {name: self.folder / output.path for name, output in self.manifest.outputs.items()}
 
     def logs(self) -> list[Path]:
-        """Return the logs of a recording; an imported data set has one for each episode."""
+        """Return the logs of a recording; an imported data set has a log for each episode."""
         names = [name for name in self.outputs if name == "log" or name.startswith("log_")]
         return [self.output(name) for name in sorted(names, key=lambda name: (len(name), name)) or ["log"]]
 
@@ -148,7 +148,7 @@ class StageFolder:
         """Return the path of one output.
 
         Raises:
-            Sim2RealError: When the stage has no such output, or the file was deleted.
+            Sim2RealError: The stage has no such output, or the file was deleted.
         """
         paths = self.outputs
         if name not in paths:
@@ -162,7 +162,7 @@ class StageFolder:
         return paths[name]
 
 
-# -- a stage that runs
+# -- a running stage
 
 
 @dataclass
@@ -180,7 +180,7 @@ class OpenStage:
         return self.folder.parent
 
     def output(self, name: str, path: Path | str) -> Path:
-        """Register an output by its path in the stage's folder; return the absolute path. The stage's end hashes it."""
+        """Register an output by its path in the stage's folder; return the absolute path. It is hashed at the end."""
         full = self.folder / path
         if not full.resolve().is_relative_to(self.folder.resolve()):
             raise UsageError(f"output {name!r} must lie in {self.folder}, got {path}")
@@ -222,17 +222,17 @@ def open_stage(
         exit code.
 
     Raises:
-        UsageError: When the name of the stage or the pipeline is no valid folder name.
-        Sim2RealError: When an input, or an output after the block, does not exist, or the disk is full.
+        UsageError: The name of the stage or the pipeline is no valid folder name.
+        Sim2RealError: An input, or an output after the block, does not exist, or the disk is full.
     """
-    # Refuse names that are no folder in the folder of runs, as a pipeline's name can come from a file.
+    # Refuse names that would lead out of the folder of runs: a pipeline's name may come from a file.
     if not stage.isidentifier():
         raise UsageError(f"{stage!r} is no name for a stage", hint="letters, digits and '_'; a letter first")
     if not _NAME.fullmatch(pipeline):
         raise UsageError(
             f"{pipeline!r} is no name for a pipeline", hint="letters, digits, '_', '-' and '.'; a letter or digit first"
         )
-    # Hash the inputs first, as the stage can take hours and files can change.
+    # Hash the inputs first, because files may change while the stage runs for hours.
     hashes = {name: sha256(Path(path)) for name, path in (inputs or {}).items()}
     folder = _stage_folder(run_dir or new_run(root, pipeline), stage)
     manifest = Manifest(
@@ -350,7 +350,7 @@ def _made(folder: Path) -> bool:
 
 
 def attempts(run_dir: Path, stage: str) -> list[StageFolder]:
-    """Return all attempts at a stage in a run folder, the latest number first, as clocks can be set back."""
+    """Return all attempts at a stage in a run folder, by descending number, as clocks can be set back."""
     numbers = [int(f.suffix[1:]) for f in run_dir.glob(f"{stage}.*") if f.suffix[1:].isdecimal()]
     folders = [*(run_dir / f"{stage}.{n}" for n in sorted(numbers, reverse=True)), run_dir / stage]
     return [attempt for folder in folders if (attempt := StageFolder.read(folder)) is not None]
@@ -420,7 +420,7 @@ def newest(root: Path, pipeline: str, stage: str, run_dir: Path | None = None) -
     return max(candidates, key=lambda c: c.manifest.started)
 
 
-# -- whether a stage is up to date: by the hashes in manifests alone, so that large logs cost no time
+# -- whether a stage is up to date, by the hashes in manifests, so that large logs are not read
 
 
 @dataclass(frozen=True)
@@ -447,11 +447,12 @@ def stage_status(run_dir: Path) -> dict[str, StageStatus]:
 def why_stale(attempt: StageFolder, status: Mapping[str, StageStatus]) -> str:
     """Return why a finished attempt is out of date; "" if it is current.
 
-    A stage is current if it was made from the newest finished attempt at the stage before it, and that is current.
+    A stage is current if it was made from the newest finished attempt at the stage before it, and if that one is
+    current.
     """
     before, output = TAKES.get(attempt.stage, ("", ""))
     if before not in status:
-        return ""  # the run began with this stage: its input comes from elsewhere
+        return ""  # the run began with this stage: its inputs come from elsewhere
     source = status[before]
     name, source_name = attempt.folder.name, source.newest.folder.name
     if not _made_from(attempt, source.newest, output):
@@ -463,13 +464,13 @@ def _made_from(attempt: StageFolder, source: StageFolder, output: str) -> bool:
     """Return whether one of a stage's inputs is an output of the stage before it."""
     manifest = attempt.manifest
     if attempt.stage == "train" and (manifest.config or {}).get("model") == "nominal":
-        return True  # the nominal model needs no identification, so none makes its policy out of date
+        return True  # a policy for the nominal model does not depend on an identification
     inputs = {entry.sha256 for entry in manifest.inputs.values()}
     entry = source.manifest.outputs.get(output)
     if entry is not None and entry.sha256 in inputs:
         return True
-    # An identification can read logs from outside of this run's recordings: of a deployment, or of the user. It is out
-    # of date when the robot is recorded again.
+    # An identification may read logs of a deployment, or of the user. It is out of date when the robot is recorded
+    # # again.
     if attempt.stage != "identify" or not inputs:
         return False
     recorded = {e.sha256 for a in attempts(attempt.run_dir, "record") for e in a.manifest.outputs.values()}
@@ -489,7 +490,7 @@ def write_manifest(folder: Path, manifest: Manifest, lock: bool = False) -> int 
         The file descriptor that holds the lock; its owner closes it. None without a lock.
 
     Raises:
-        TypeError: When a value has no plain JSON form.
+        TypeError: A value has no form in JSON.
     """
     text = to_json(manifest)
     # Lock before the rename: no reader finds the manifest without its lock.
@@ -539,7 +540,7 @@ def _read_with_lock(path: Path) -> tuple[bytes, bool]:
             return text, locked
 
 
-# -- what results depend on
+# -- hashes and versions on which results depend
 
 
 def portable(path: Path, run_dir: Path) -> str:

@@ -22,7 +22,7 @@ _AGAIN = "run `sim2real train` again"
 
 @dataclass(frozen=True)
 class Moved:
-    """One parameter at several values; the others follow by their covariance.
+    """Success with one parameter at several values; the others follow by their covariance.
 
     Attributes:
         estimate: The estimate [unit].
@@ -57,7 +57,7 @@ class Sensitivity:
     parameters: tuple[Moved, ...]
 
     def __post_init__(self) -> None:
-        """Check the sizes, as the curves can come from a file."""
+        """Check the sizes, because the curves may come from a file."""
         count = self.multiples.shape
         check(len(count) == 1 and count[0] > 0, "no multiples")
         check(all(p.values.shape == p.success.shape == count for p in self.parameters), "curves of mixed sizes")

@@ -19,7 +19,7 @@ _UNITS = {"_rad_s": "rad/s", "_m_s": "m/s", "_rad": "rad", "_nm": "N m", "_v": "
 
 @dataclass(frozen=True)
 class Interval:
-    """A 95 % interval as a cell of a table; None at both ends where it is unknown."""
+    """A 95 % interval as a cell of a table; both ends are None if it is unknown."""
 
     low: float | None
     high: float | None
@@ -29,7 +29,7 @@ class Interval:
 
 
 Cell: TypeAlias = str | float | bool | Interval | None
-"""A text, a number, a yes or no, an interval; None for a missing value."""
+"""A cell: text, number, boolean or interval; None for a missing value."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class ArtifactTable:
 
     Attributes:
         headers: Titles of the columns; the column ``unit`` holds units.
-        rows: The cells by row; the first one names the row.
+        rows: Rows of cells; the first cell is the row's name.
     """
 
     headers: Sequence[str]

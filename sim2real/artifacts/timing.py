@@ -1,7 +1,7 @@
-"""The timing of one session, from which training draws its delays without the log.
+"""The timing of one session, from which training draws delays without the log.
 
 ``timing.npz`` has every node's computation times and bus transfers, and every connection's transport times, in order.
-``timing.json`` has quantiles of the nodes for people. The log's end has the session's counts, such as lost answers.
+``timing.json`` has quantiles for each node, for people to read.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _AGAIN = "record again, or run `sim2real identify` again on the log"
 
 @dataclass(frozen=True)
 class Spread:
-    """Median, 99 % quantile and maximum of times [s]; None without any sample."""
+    """Median, 99 % quantile and maximum of times [s]; None without samples."""
 
     p50: float | None
     p99: float | None
@@ -61,9 +61,9 @@ class NodeTiming:
         period: Time between the wake-ups of two steps.
         lateness: Time from a step's start to the wake-up of its thread.
         computation: Time from a step's start to its end, with wake-up and bus.
-        bus: Part of the computation from the lock of the bus to the device's answer, with retries; no sample for a node
-            without a device, and in logs without bus times.
-        age: Input -> time from the sending of the newest used message to the step's start.
+        bus: Part of the computation from the lock of the bus to the device's answer, with retries; no samples for a
+            node without a device.
+        age: Input -> time from the sending of its newest message to the step's start.
         overruns: Number of steps that ended after the start of the next slot; None if they were not counted.
     """
 
@@ -97,7 +97,7 @@ class Timing(Shown):
         """Return the timing of a log, with the counts that the session wrote at its end."""
         end: Mapping[str, Json] = episode.metadata.get("log", {}).get("session_end") or {}
         counted: Mapping[str, Json] = end.get("timing", {})
-        # A session's own summary has the nodes in their graph's order, with overruns; other logs lack only that.
+        # A session's summary has the nodes in the graph's order, and overruns, which other logs lack.
         names = [*(n for n in counted if n in episode.steps), *(n for n in episode.steps if n not in counted)]
         # The times on the bus, in seconds, of the log's nodes.
         used: Mapping[str, Json] = end.get("bus", {})
@@ -113,10 +113,10 @@ class Timing(Shown):
         """Return the distribution of each node's computation time, from which training and simulation draw.
 
         Args:
-            longest_s: Longer steps are dropped [s]: such hiccups would put a pause into every timeline.
+            longest_s: Longer steps are dropped [s], because such hiccups would put a pause into every timeline.
 
         Returns:
-            The distributions by node, and the number of dropped steps of each node that has some.
+            The distributions by node, and the number of dropped steps of each node that has dropped steps.
 
         Raises:
             Sim2RealError: When most steps of a node would be dropped.

@@ -1,1 +1,1 @@
-"""The command line's commands: flags, the run loop, import and export, new, info."""
+"""The commands of the command line."""

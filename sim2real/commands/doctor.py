@@ -1,4 +1,4 @@
-"""``sim2real doctor``: why a policy works in simulation and fails on the robot."""
+"""``sim2real doctor``: finds out why a policy works in simulation and fails on the robot."""
 
 import json
 import sys
@@ -14,18 +14,18 @@ from sim2real.stages.terminal.console import note, progress, wrote
 
 @dataclass(frozen=True)
 class DoctorConfig:
-    """Say why a policy works in simulation and fails on the robot; without --log: what may fail before it moves."""
+    """Find out why a policy works in simulation and fails on the robot; without --log, check it before it moves."""
 
     policy: Annotated[Path | None, Flag("FILE")] = None
     """The policy: an ONNX file of any trainer, or the folder of a bundle."""
     log: Annotated[Path | None, Flag("FILE")] = None
-    """Log of the deployment: of this project, or CSV, NPZ, JSON or a bag with a row for each step of the policy."""
+    """Log of the deployment: a log of sim2real, or CSV, NPZ, JSON or a bag with a row for each step of the policy."""
     mjcf: Annotated[Path | None, Flag("ROBOT.xml")] = None
-    """The model that the policy was trained on."""
+    """The model on which the policy was trained."""
     contract: Annotated[Path | None, Flag("FILE")] = None
-    """What the policy expects: contract.toml, Unitree's deploy.yaml, or Isaac Lab's env.yaml."""
+    """Description of the policy's inputs and outputs: contract.toml, Unitree's deploy.yaml, or Isaac Lab's env.yaml."""
     sim: Annotated[Path | None, Flag("FILE")] = None
-    """Log of the same policy in simulation, whose times count as those of the training."""
+    """Log of the same policy in simulation, whose timing stands for the timing in training."""
     out: Path = Path("doctor")
     """Folder of the page, and of a contract file with questions."""
     bundle: Annotated[Path | None, Flag("FOLDER")] = None
@@ -48,7 +48,7 @@ def doctor(command: str, arguments: list[str]) -> None:
 
 
 def _answer(config: DoctorConfig) -> tuple[dict[str, Any], list[str], bool]:
-    """Return the answer as data and as lines, and whether something is wrong; write the page or the bundle."""
+    """Return the diagnosis as data and as lines, and whether a fault was found; write the page or the bundle."""
     if config.policy is None or (config.log is None and config.mjcf is None and config.bundle is None):
         raise UsageError("doctor needs --policy, and --log of the robot or --mjcf of the model, or both")
     from sim2real.doctor.before import examine

@@ -23,15 +23,15 @@ EXAMPLE = "run_policy.py"
 
 @dataclass(frozen=True)
 class ExportConfig:
-    """Write the estimates as a model of another simulator, or a policy for a machine that has numpy alone."""
+    """Write the estimates as a model of another simulator, or a policy for a machine that has only numpy."""
 
     source: Annotated[str, Flag("RUN|PIPELINE|FILE", positional=True, needed=True)] = ""
-    """A run folder, a pipeline, whose newest result is taken, a parameters.json, or the folder of a policy bundle."""
+    """A run folder, a pipeline (its newest result is taken), a parameters.json, or the folder of a policy bundle."""
     to: Format = "mjcf"
     """Format: a model for MuJoCo, a Python file for mjlab or for Isaac Lab, everything as JSON; a model card: a folder
     with a page and a script that computes each figure again; a policy: its bundle with a script that runs it."""
     out: Annotated[Path | None, Flag("PATH")] = None
-    """The file or folder to write; default: one in the working directory that is called after the pipeline."""
+    """The file or folder to write; default: named after the pipeline, in the working directory."""
     runs: Path = Path("runs")
     """Folder of all runs."""
 
@@ -71,7 +71,7 @@ def run(config: ExportConfig) -> Path:
 
 
 def _export_policy(bundle: Path, out: Path | None) -> Path:
-    """Copy a bundle, write the script that runs it beside it, and return the folder.
+    """Copy a bundle, add a script that runs it, and return the folder.
 
     Raises:
         UsageError: The folder is not empty.
@@ -82,10 +82,10 @@ def _export_policy(bundle: Path, out: Path | None) -> Path:
     from sim2real.policy.contract import NetworkSpec
     from sim2real.stages.terminal.console import note, wrote
 
-    contract = load_bundle(bundle).contract  # refuses a damaged bundle
+    contract = load_bundle(bundle).contract  # raises an error for a damaged bundle
     out = out or Path(f"{contract.robot or bundle.resolve().parent.name}_{FILES['policy']}")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise UsageError(f"{out} is there and not empty", hint="name another folder with --out")
+        raise UsageError(f"{out} exists and is not empty", hint="name another folder with --out")
     out.mkdir(parents=True, exist_ok=True)
     for name in (WEIGHTS, GRAPH, CONTRACT):
         shutil.copyfile(bundle / name, out / name)

@@ -1,4 +1,4 @@
-"""Command-line flags from configurations: a field is a flag, its docstring the help, its value the default."""
+"""Makes command-line flags from configurations: a field is a flag, its docstring the help, its value the default."""
 
 import argparse
 import ast
@@ -40,11 +40,11 @@ _SHOWN: Mapping[str, str] = {
     "ImportConfig": "files mapping pipeline mjcf joints unit calibration rate_hz out",
     "ReportConfig": "targets rerun out json runs",
 }
-"""Configuration, or a field that holds it -> the fields that ``--help`` shows, where ``--help-all`` shows more."""
+"""Configuration, or the field that holds it -> the fields that ``--help`` shows; ``--help-all`` shows all."""
 _WIDTH, _COLUMN = 110, 28
 """Largest width of the help, and the column where its texts begin."""
 _MAX_LISTED_FLAGS = 20
-"""A refusal lists at most this many flags."""
+"""Most flags that an error lists."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class _Option:
 
     @property
     def off(self) -> str:
-        """The flag that switches it off: ``--record.no-dry-run``."""
+        """The flag that switches the option off: ``--record.no-dry-run``."""
         prefix, dot, last = self.name[2:].rpartition(".")
         return f"--{prefix}{dot}no-{last}"
 
@@ -81,8 +81,8 @@ def parse(default: Config, arguments: Sequence[str], prog: str, *examples: str, 
 
     Args:
         default: A dataclass; its values are the defaults.
-        examples: Commands without ``sim2real``, for the end of the help.
-        text: What the command does; default: the first line of the configuration's docstring.
+        examples: Example commands without ``sim2real``, for the end of the help.
+        text: Description of the command; default: the first line of the configuration's docstring.
 
     Raises:
         UsageError: A flag is unknown, a value does not fit, or one is missing.
@@ -122,7 +122,7 @@ def _options(
     """Yield the flags of a configuration, nested ones with their prefix.
 
     Args:
-        place: Class and field that hold it: ``RunFlags.record``.
+        place: Class and field that hold the configuration: ``RunFlags.record``.
     """
     kind = type(config)
     hints, texts = get_type_hints(kind, include_extras=True), _docstrings(kind)
@@ -142,7 +142,7 @@ def _options(
 
 @cache
 def _docstrings(kind: type) -> dict[str, str]:
-    """Return field -> the text below it in the source of its class."""
+    """Return field -> the docstring below it in the source of its class."""
     texts: dict[str, str] = {}
     for base in reversed(kind.__mro__[:-1]):
         if not is_dataclass(base):
@@ -212,7 +212,7 @@ def _refuse() -> NoReturn:
 
 
 def _replaced(config: Any, values: Mapping[tuple[str, ...], Any], path: tuple[str, ...]) -> Any:
-    """Return the configuration with new values of the fields at or below a path; its own checks run."""
+    """Return the configuration with new values of the fields at or below a path; this runs its checks."""
     changed = {}
     for item in fields(config):
         here = (*path, item.name)
@@ -224,7 +224,7 @@ def _replaced(config: Any, values: Mapping[tuple[str, ...], Any], path: tuple[st
 
 
 def _unknown(unknown: Sequence[str], options: Sequence[_Option], prog: str) -> UsageError:
-    """Return the error for words that no flag took."""
+    """Return the error for words that belong to no flag."""
     written = [word.split("=")[0] for word in unknown if word.startswith("-")]
     if not written:
         return UsageError(f"unexpected argument {unknown[0]!r}", hint=f"see `{prog} --help`")
@@ -242,7 +242,8 @@ def _help(options: Sequence[_Option], prog: str, text: str, examples: Sequence[s
     """Return the help: one block of flags for each nested configuration."""
     values = [o for o in options if o.mark.positional]
     listed = [o for o in options if o not in values and (o.shown or everything)]
-    listed.sort(key=lambda o: "." in o.name)  # a flag of no block would seem to belong to the block above it
+    # Flags without a block come first: otherwise they would seem to belong to the block above.
+    listed.sort(key=lambda o: "." in o.name)
     usage = " ".join([prog, *(_placeholder(o) for o in values), "[FLAGS]"])
     lines = [f"usage: {usage}", "", *textwrap.wrap(text, _width()), ""]
     for value in values:
@@ -290,7 +291,7 @@ def _placeholder_of(kind: Any) -> str:
 
 
 def _text(value: Any) -> str:
-    """Return a default as text; "" for one that says nothing."""
+    """Return a default as text; "" for a default that needs no mention."""
     if value is None or value is False or value in ("", (), {}):
         return ""
     if isinstance(value, dict):
@@ -301,12 +302,12 @@ def _text(value: Any) -> str:
 
 
 def _unmarked(kind: Any) -> Any:
-    """Return a type without its marks."""
+    """Return a type without its annotations."""
     return get_args(kind)[0] if hasattr(kind, "__metadata__") else kind
 
 
 def _bare(kind: Any) -> Any:
-    """Return a type without marks and without None."""
+    """Return a type without annotations and without None."""
     kind = _unmarked(kind)
     if get_origin(kind) in (Union, types.UnionType):
         return next(inner for inner in get_args(kind) if inner is not types.NoneType)

@@ -1,4 +1,4 @@
-"""``sim2real info``: about the installation, a pipeline, a log or a run."""
+"""``sim2real info``: describes the installation, a pipeline, a log or a run."""
 
 import json
 import os
@@ -22,7 +22,7 @@ from sim2real.stages.terminal.console import pairs, table
 
 @dataclass(frozen=True)
 class InfoConfig:
-    """About the installation; or about a pipeline, a log, a run folder."""
+    """Describe the installation, or a pipeline, a log or a run folder."""
 
     target: Annotated[str | None, Flag("PIPELINE|LOG|RUN", positional=True)] = None
     """A pipeline, an MCAP log, or a run folder; default: the installation."""
@@ -50,7 +50,7 @@ def installation() -> str:
     for name, source in sorted(available().items()):
         try:
             summary = summary_of(name)
-        except Exception as error:  # one broken pipeline must not hide the others
+        except Exception as error:  # a broken pipeline must not hide the others
             summary = f"cannot be imported: {type(error).__name__}: {error}"
         rows.append([name, summary, _origin(source)])
     blocks = [pairs({**versions(), "compiled programs": _programs()}), table(rows, ["pipeline", "summary", "from"])]
@@ -61,7 +61,7 @@ def installation() -> str:
 
 
 def _programs() -> str:
-    """Return where compiled programs are kept."""
+    """Return where compiled programs are stored."""
     folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or compilation_cache.location()
     return f"not kept: {compilation_cache.VARIABLE} is {compilation_cache.OFF}" if folder is None else shown(folder)
 
@@ -88,11 +88,11 @@ def _commands(name: str) -> str:
     """Return the commands that work for a pipeline: a recorded robot has no hardware, task and policy."""
     try:
         robot = load_robot(name)
-    except Sim2RealError as error:  # such as a package that is not installed
+    except Sim2RealError as error:  # for example, a package is not installed
         return f"none: {error.args[0]}"
     from sim2real.robots.robot import Robot  # imports JAX
 
-    if isinstance(robot, Robot) and getattr(robot, "motors", True) is None:  # legs without a device
+    if isinstance(robot, Robot) and getattr(robot, "motors", True) is None:  # a robot without a device
         return f"sim2real train {name}, sim2real play {name}"
     if isinstance(robot, Robot):
         return f"sim2real run {name}; record, identify, train, deploy one by one"
@@ -100,7 +100,7 @@ def _commands(name: str) -> str:
 
 
 def run(run_dir: Path) -> str:
-    """Return the attempts of the stages of a run, and their files; each manifest has the rest."""
+    """Return the attempts at the stages of a run, and their files."""
     rows = []
     stale = {s.newest.folder.name: s.stale for s in stage_status(run_dir).values() if s.stale}
     for stage in STAGES:
@@ -115,12 +115,12 @@ def run(run_dir: Path) -> str:
 
 
 def log(path: Path) -> str:
-    """Return a log's own description, and its topics; a log that was cut is read up to the cut.
+    """Return a log's metadata and its topics; a truncated log is read up to its end.
 
     Raises:
-        Sim2RealError: When the file is no log, or cut within its first record.
+        Sim2RealError: The file is no log, or is cut within its first record.
     """
-    from sim2real.log import summary  # imports JAX, which the rest of `info` does without
+    from sim2real.log import summary  # imported late: it imports JAX
 
     # Facts of the file, then its topics and metadata.
     facts = summary(path)
@@ -141,7 +141,7 @@ def log(path: Path) -> str:
 
 
 def _origin(source: Any) -> str:
-    """Return where something that goes by a name comes from: a folder, a module, or an installed package."""
+    """Return the origin of a pipeline, device or world: a folder, a module, or an installed package."""
     if isinstance(source, Path):
         return shown(source)
     return source if isinstance(source, str) else f"entry point {source.value}"

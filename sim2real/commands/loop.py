@@ -1,4 +1,4 @@
-"""The loop of a run: the four stages, then iterations, in which each verdict decides which stages run again."""
+"""The loop of a run: the four stages, then iterations, in which each verdict selects the stages that run again."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ def run_all(robot: RecordedRobot, flags: RunFlags, call: CallStage) -> Path | No
     # Refuse a dry recording, and find an interrupted run.
     if flags.record.dry_run:
         raise UsageError(
-            "a dry recording holds no motion: a run cannot identify from it",
-            hint=f"`sim2real record {robot.name} --dry-run` records alone; of a run, only deploy can be dry",
+            "a dry recording has no motion: a run cannot identify from it",
+            hint=f"`sim2real record {robot.name} --dry-run` only records; in a run, only deploy can be dry",
         )
     run_dir = find_run(flags.runs, flags.resume, robot.name) if flags.resume else None
     shipped = why_shipped(robot)
@@ -66,7 +66,7 @@ def run_all(robot: RecordedRobot, flags: RunFlags, call: CallStage) -> Path | No
 
 
 def why_shipped(robot: RecordedRobot) -> str:
-    """Return why a run deploys the policy that its pipeline ships; "" if it trains one."""
+    """Return why a run deploys the shipped policy of its pipeline; "" if it trains a policy."""
     if shipped_policy(robot.folder) is None:
         return ""
     import jax
@@ -82,8 +82,8 @@ class Plan:
 
     Attributes:
         why: Why the run stops.
-        terms: The optional terms to identify with; None for the flags' value.
-        seed: The seed of the training; None for the flags' value.
+        terms: The optional terms to identify with; None: as in the flags.
+        seed: The seed of the training; None: as in the flags.
     """
 
     stages: tuple[str, ...]
@@ -101,7 +101,7 @@ class _Iterating:
     call: CallStage
 
     def run(self, run_dir: Path | None) -> Path:
-        """Run the stages of a plan, make the next plan; until a plan has no stages.
+        """Run the stages of a plan and make the next plan, until a plan has no stages.
 
         Args:
             run_dir: The run's folder; None: the first stage makes it.
@@ -130,7 +130,7 @@ class _Iterating:
             note(f"iteration {len(rows)}: {rows[-1].verdict}; {plan.why or ', '.join(plan.stages)}")
         if refusal is not None:
             raise refusal
-        assert run_dir is not None  # only a plan for a run that exists has no stages
+        assert run_dir is not None  # a plan without stages belongs to an existing run
         print(artifact_table(iterations_table(iterations(run_dir)).without("why")))
         return run_dir
 
@@ -138,25 +138,25 @@ class _Iterating:
         """Return the plan that follows from the stages of a run.
 
         Args:
-            resumed: Whether no plan has run yet: then stages may lack. After a plan has run, the deployment alone
-                decides, so that no stage runs more often than there are iterations.
+            resumed: Whether no plan has run yet: then stages may be missing. After that, only the deployment decides,
+                so that no stage runs more often than there are iterations.
         """
         rows, status = iterations(run_dir), stage_status(run_dir)
         lacking = tuple(s for s in STAGES if s not in status or status[s].stale)
         if not rows:
             return Plan(lacking)
         last, verdict, stages = rows[-1], None, STAGES
-        # A recording that is older than the refusal of a policy shows another robot.
+        # A recording from before the refusal of a policy shows the robot before it changed.
         recorded = status["record"].newest.manifest.started if "record" in status else ""
         if not (last.refused and recorded < last.deployment.manifest.started):
             deployment = None if last.refused else Deployment.read(last.deployment.folder)
             verdict = None if deployment is None else deployment.verdict
-            if lacking and resumed:  # the run was interrupted, or a stage was made by hand
+            if lacking and resumed:  # the run was interrupted, or the user ran a stage alone
                 return self._again(run_dir, lacking, verdict)
             if deployment is not None and (why := _why_stopped(deployment)):
                 return Plan((), f"stop: {why}")
-            # Train alone if the model holds, and the timing of the training does, too. Otherwise record: the motion of
-            # a policy may not separate a delay from inertia.
+            # Only train again if the model and the timing still hold. Otherwise record: the motion of a policy may not
+            # # separate a delay from inertia.
             if verdict is not None and verdict.stages == ("train",):
                 stages = ("train", "deploy")
         if len(rows) >= self.flags.iterations:
@@ -164,12 +164,12 @@ class _Iterating:
         return self._again(run_dir, stages, verdict)
 
     def _again(self, run_dir: Path, stages: tuple[str, ...], verdict: Verdict | None) -> Plan:
-        """Return the plan to run stages with the terms of the newest identification, and another seed."""
+        """Return the plan to run stages again, with the terms of the newest identification and another seed."""
         identified, trained = finished(run_dir, "identify"), finished(run_dir, "train")
         if identified is None:
             return Plan(stages)
         known = Identification.load(identified.output("parameters"))
-        # The verdict adds the term of a parameter that changed to those of the identification.
+        # The verdict adds the term of a changed parameter to the terms of the identification.
         terms = self.flags.identify.terms
         if terms not in ("auto", "all") and verdict is not None and verdict.terms:
             terms = verdict.terms
@@ -180,7 +180,7 @@ class _Iterating:
         return Plan(stages, terms=terms, seed=seed)
 
     def _config(self, plan: Plan, stage: str) -> Any:
-        """Return the configuration of a stage: that of the flags, with the changes of the plan."""
+        """Return the configuration of a stage: the flags, with the changes of the plan."""
         if stage == "identify" and plan.terms is not None:
             return replace(self.flags.identify, log=(), terms=plan.terms)
         if stage == "train" and plan.seed is not None:
@@ -201,7 +201,7 @@ def _why_stopped(deployment: Deployment) -> str:
 
 @dataclass(frozen=True, repr=False)
 class Run(Shown):
-    """A run folder: the newest finished result of each stage, read when it is first asked for."""
+    """The newest finished result of each stage in a run folder; each is read at its first use."""
 
     folder: Path
 
@@ -250,7 +250,7 @@ def run(
     Args:
         robot: The robot, or the name of its pipeline.
         record: Settings of record; default: the robot's. A dict has the settings that differ from these.
-        resume: A run folder to go on with, from the first stage that is not finished there.
+        resume: A run folder to continue, from the first stage that is not finished.
         iterations: Most iterations; see ``sim2real run --help``.
 
     Returns:

@@ -27,7 +27,7 @@ _COMMANDS = {
     "mit": ("goal", "goal_velocity", "torque", "kp", "kd"),
 }
 _PIPELINES = Path("pipelines")
-_SILENCE_S = 1.0  # torque is off, so a lost answer is no danger
+_SILENCE_S = 1.0  # torque is off, so lost answers are no danger
 _OF_MODEL = {
     "__init__.py": '''"""Recorded robot of {joints}, identified from its model."""
 
@@ -72,7 +72,7 @@ from sim2real.stages.load import load_module
 ROBOT = load_module("{like}", "guide").robot(Path(__file__).with_name("calibration.json"))
 ''',
 }
-"""Texts of the files of a pipeline: of a model, and of a robot like another one."""
+"""Templates of a pipeline's files: for a robot with a model, and for a robot like another one."""
 
 
 @dataclass(frozen=True)
@@ -83,12 +83,13 @@ class NewConfig:
     """Name of the pipeline: small letters, digits and underscores."""
     robot: Annotated[RobotFlags, Flag(flat=True)] = field(default_factory=RobotFlags)
     log: Annotated[str | None, Flag("FILE")] = None
-    """Log of the robot; its commands, measurements and rate are taken over."""
+    """Log of the robot, from which commands, measurements and rate are taken."""
     drive: Literal["position", "velocity", "torque", "duty", "mit"] = "position"
-    """Command of the drives, if there is no log."""
+    """Kind of command of the drives, if there is no log."""
     like: Annotated[str | None, Flag("PIPELINE")] = None
-    """Instead of a model: the pipeline of a robot like this one. Checks the calibration of the robot on --port,
-    then records and identifies it."""
+    """Instead of a model: pipeline of the same kind of robot. Checks the calibration of the robot on --port, then
+    records and identifies it.
+    """
     port: Annotated[str | None, Flag("PORT")] = None
     """Serial port of the robot, for --like."""
     runs: Path = Path("runs")
@@ -110,7 +111,7 @@ def _from_model(config: NewConfig) -> None:
     """Write a pipeline's folder for a model.
 
     Raises:
-        UsageError: The name is none, the folder exists, or the model cannot be driven.
+        UsageError: The name is not allowed, the folder exists, or the model has no joint that can be driven.
     """
     import msgspec
 
@@ -205,7 +206,7 @@ def _run_like(config: NewConfig, like: str) -> bool:
         shutil.copy(calibration, folder)
     wrote(folder / calibration.name)
     _write(folder, {name: text.format(like=like, port=config.port) for name, text in _OF_LIKE.items()})
-    # The only question: from here on the arm moves.
+    # Ask once, because the arm moves from here on.
     robot, defaults = load_robot(config.name), defaults_of(config.name)
     _ask(f"The arm moves next, for {defaults.record.duration_s:g} s: let go of it, clear its table, and press Enter. ")
     recorded = run_stage("record", robot, defaults.record, config.runs, None, page=False)
@@ -243,7 +244,7 @@ def calibrate(port: str, guide: Any, path: Path) -> None:
         source: Path = guide.calibration_of([servos.link.read(i, HOMING_OFFSET) for i in guide.IDS])
     joints = guide.read(source)
     note(f"calibration: {source}", urgent=True)
-    # Opening compares models, homing offsets and limits with the calibration, and takes the torque off.
+    # Opening the arm compares models, homing offsets and limits with the calibration, and takes the torque off.
     with StsServos(bus, joints) as servos:
         motion = HandMotion(joints, guide.NUDGES)
         note(f"torque is off. Move the arm by hand. Its middle pose: {guide.MIDDLE}", urgent=True)
@@ -261,5 +262,5 @@ def _ask(question: str) -> None:
     print(question, end="", file=sys.stderr, flush=True)
     if not sys.stdin.readline():
         raise UsageError(
-            "there was no answer, so the arm was not recorded", hint="`sim2real record NAME` records it later"
+            "Enter was not pressed, so the arm was not recorded", hint="`sim2real record NAME` records it later"
         )

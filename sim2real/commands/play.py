@@ -1,4 +1,4 @@
-"""``sim2real play``: a policy walks on a twin in C MuJoCo, in a window or into a moving picture."""
+"""``sim2real play``: lets a policy walk on a twin in C MuJoCo, in a window or as an animation."""
 
 import time
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 _FRAMES_PER_S = 12.5
 _KEYS = {265: (0, 0.1), 264: (0, -0.1), 44: (1, 0.1), 46: (1, -0.1), 263: (2, 0.1), 262: (2, -0.1)}
-"""Key of GLFW -> entry of the command, and its change: arrows, comma, full stop."""
+"""Key of GLFW (arrows, comma, full stop) -> entry of the command, and its change."""
 _SPACE = 32
 
 
@@ -27,9 +27,9 @@ class PlayConfig:
     """Let a policy walk on a twin in C MuJoCo, with delays and noise."""
 
     source: Annotated[str, Flag("RUN|PIPELINE|BUNDLE", positional=True, needed=True)] = ""
-    """A bundle's folder, a run folder, or a pipeline, whose newest training is taken, or its shipped bundle."""
+    """A bundle's folder, a run folder, or a pipeline (its newest training, or its shipped bundle)."""
     command: tuple[float, float, float] = (0.6, 0.0, 0.0)
-    """Velocity: forwards, to the left [m/s], yaw rate [rad/s]."""
+    """Commanded velocity: forwards, to the left [m/s], yaw rate [rad/s]."""
     duration_s: float = 10.0
     """Length of the episode [s]."""
     push: float = 0.0
@@ -37,8 +37,9 @@ class PlayConfig:
     seed: int | None = None
     """Seed of a twin with other friction, load, motors and delays; default: the nominal twin."""
     view: Annotated[str | None, Flag("[FILE.gif]", alone=WINDOW)] = None
-    """Show it in MuJoCo's window; the arrow keys change forward velocity and yaw rate, comma and full stop the sideways
-    one, the space bar stops. With a name: a moving picture from the side, which needs no display."""
+    """Show the walk in MuJoCo's window: arrow keys change forward velocity and yaw rate, comma and full stop the
+    sideways velocity, the space bar stops. With FILE.gif: write an animation from the side, which needs no display.
+    """
     runs: Path = Path("runs")
     """Folder of all runs."""
 
@@ -59,7 +60,7 @@ def play(command: str, arguments: list[str]) -> None:
 
 
 def run(config: PlayConfig) -> "Walked":
-    """Walk, print how far the robot was off its command, and return the walk.
+    """Walk, print the errors of the velocity, and return the walk.
 
     Raises:
         UsageError: There is no policy, or the robot does not walk.
@@ -72,11 +73,11 @@ def run(config: PlayConfig) -> "Walked":
     from sim2real.robots.walking.twin import Twin, walk
     from sim2real.stages.terminal.console import note, progress, wrote
 
-    # Find the policy, and the robot that it is for.
+    # Find the policy and its robot.
     folder, pipelines = find_bundle(config.source, config.runs), available()
     names = (config.source, *(p.name for p in folder.resolve().parents))
     if (name := next((n for n in names if n in pipelines), None)) is None:
-        raise UsageError(f"{folder} lies in no folder of a pipeline", hint="sim2real play go2")
+        raise UsageError(f"{folder} is not in the folder of a pipeline", hint="sim2real play go2")
     robot: Any = load_robot(name)
     if not isinstance(robot, ComposedRobot):
         raise UsageError(f"pipeline {name!r} does not walk", hint="sim2real play go2")
@@ -99,7 +100,7 @@ def run(config: PlayConfig) -> "Walked":
 
 
 def _window(twin: "Twin", wanted: "np.ndarray") -> Any:
-    """Open a window whose keys steer; return what shows a policy step at its time."""
+    """Open a window whose keys steer; return a function that shows a policy step at its time."""
     from mujoco import viewer
 
     def steer(key: int) -> None:
@@ -120,7 +121,7 @@ def _window(twin: "Twin", wanted: "np.ndarray") -> Any:
 
 
 def _write_picture(twin: "Twin", qpos: "np.ndarray", out: Path) -> None:
-    """Write the robot from the side, as a moving picture of its links."""
+    """Write an animation of the robot's links, seen from the side."""
     from matplotlib.animation import PillowWriter
     from matplotlib.figure import Figure
 

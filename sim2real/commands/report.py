@@ -1,4 +1,4 @@
-"""``sim2real report``: a run as an HTML page, in the Rerun viewer, or beside other runs."""
+"""``sim2real report``: shows a run as an HTML page or in the Rerun viewer, or compares runs."""
 
 from __future__ import annotations
 
@@ -25,15 +25,16 @@ class ReportConfig:
     """Write a run as one HTML page, show it in the Rerun viewer, or compare runs of one robot."""
 
     targets: Annotated[tuple[str, ...], Flag("RUN|PIPELINE...", positional=True, needed=True)] = ()
-    """A run folder, its name, a folder of a stage in it, or a pipeline, whose newest run is taken. Several: their
-    parameters, errors and success side by side."""
+    """A run folder, its name, a stage folder in it, or a pipeline (its newest run). Several are compared: parameters,
+    errors and success.
+    """
     rerun: Annotated[str | None, Flag("[web|FILE.rrd]", alone=WINDOW)] = None
     """Open the run in the Rerun viewer instead of writing a page; 'web': on a page for browsers, until Ctrl-C;
     FILE.rrd: a recording for the viewer."""
     follow: bool = False
-    """With --rerun: join a run whose stages are still running, until Ctrl-C."""
+    """With --rerun: follow a run whose stages are still running, until Ctrl-C."""
     out: Annotated[Path | None, Flag("FILE")] = None
-    """The page to write; default: report.html in the run's folder, of several runs compare.html here."""
+    """The page to write; default: report.html in the run's folder, or compare.html in the working directory."""
     json: bool = False
     """Print the comparison of several runs as JSON."""
     runs: Path = Path("runs")
@@ -113,7 +114,7 @@ def compare(config: ReportConfig) -> Comparison:
     """Print parameters with intervals, errors and success of several runs, and write the page.
 
     Raises:
-        UsageError: Runs of different robots, or runs with nothing in common.
+        UsageError: The runs are of different robots, or have nothing in common.
         Sim2RealError: An artifact is missing or malformed.
     """
     from sim2real.artifacts.comparison import ComparedRun, Comparison
@@ -154,14 +155,14 @@ def compare(config: ReportConfig) -> Comparison:
 
     page = comparison_page(comparison, config.out or Path(COMPARISON))
     if config.json:
-        note(f"wrote {page}")  # stdout holds JSON alone
+        note(f"wrote {page}")  # stdout gets only JSON
     else:
         wrote(page)
     return comparison
 
 
 def _stages_of(target: str, root: Path) -> dict[str, StageFolder]:
-    """Return the finished stages of a run; a stage folder selects its run, with that attempt of the stage."""
+    """Return the finished stages of a run; a stage folder selects its run, and this attempt at the stage."""
     from sim2real.artifacts.run import StageFolder, finished_stages
 
     stages = finished_stages(find_run(root, target))
@@ -171,6 +172,6 @@ def _stages_of(target: str, root: Path) -> dict[str, StageFolder]:
 
 
 def _names(all_stages: Sequence[dict[str, StageFolder]]) -> list[str]:
-    """Return a name for each run: its folder's, with a number where two are the same."""
+    """Return a name for each run: its folder's name, with a number if two are equal."""
     names = [next(iter(stages.values())).run_dir.resolve().name for stages in all_stages]
     return [name if names.count(name) == 1 else f"{name} ({i + 1})" for i, name in enumerate(names)]

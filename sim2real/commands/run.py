@@ -1,4 +1,4 @@
-"""``sim2real run`` and ``demo``: the four stages in one run folder, and the iterations that the verdicts ask for."""
+"""``sim2real run`` and ``demo``: the four stages in one run folder, then iterations by the verdicts."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _FIGURES = {
     "train": ("success in simulation", "what breaks it"),
     "deploy": ("measured delay",),
 }
-"""Stage -> the figures of its summary that a run prints, beside the error and the success."""
+"""Stage -> figures of its summary that a run prints, in addition to error and success."""
 
 
 def run_command(command: str, arguments: list[str]) -> None:
@@ -44,7 +44,7 @@ def demo(command: str, arguments: list[str]) -> None:
 
 
 def _run(name: str, parsed: RunFlags) -> None:
-    """Run the stages, print the main figures of each, and end with the verdict and the page."""
+    """Run the stages, print the main figures of each, then the verdict and the page."""
     compilation_cache.enable()
     from sim2real.commands.loop import run_all
     from sim2real.stages.terminal import console

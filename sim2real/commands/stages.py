@@ -1,4 +1,4 @@
-"""The commands that call one stage or one function: parse the flags, run, print what was written."""
+"""Commands that call one stage or one function: parse the flags, run, print the written files."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class StageFlags(Generic[Config]):
     runs: Path = Path("runs")
     """Folder of all runs."""
     run: Annotated[Path | None, Flag("DIR")] = None
-    """Run folder to add to; default: a new one for record, for the others the newest one with their inputs."""
+    """Run folder to add to; default: a new one for record, otherwise the newest one with the inputs."""
 
 
 @dataclass(frozen=True)
@@ -46,9 +46,9 @@ class DemoFlags:
     runs: Path = Path("runs")
     """Folder of all runs."""
     resume: Annotated[Path | None, Flag("DIR")] = None
-    """Run folder to go on with: stages that are finished there, from the newest inputs, are skipped."""
+    """Run folder to continue; stages that are finished there, from the newest inputs, are skipped."""
     verbose: bool = False
-    """Print everything that the stages print; default: a few lines for each stage."""
+    """Print all output of the stages; default: a few lines for each stage."""
 
 
 @dataclass(frozen=True)
@@ -66,11 +66,11 @@ class RunFlags(DemoFlags):
         """Check what can be checked before anything moves."""
         if self.train.hosts.several:
             raise UsageError(
-                "only training is divided among processes: each of them would record and deploy",
+                "only training can be divided among processes: here each process would record and deploy",
                 hint="record and identify in one, then `sim2real train PIPELINE --hosts.found` in all",
             )
         if self.iterations < 1:
-            raise UsageError(f"a run iterates at least once, got {self.iterations}", hint="--iterations 5")
+            raise UsageError(f"iterations must be at least 1, got {self.iterations}", hint="--iterations 5")
 
     def with_seed(self, seed: int | None) -> RunFlags:
         """Return the flags with one seed in every stage; None changes nothing."""
@@ -135,10 +135,10 @@ def import_files(command: str, arguments: list[str]) -> None:
 def run_stage(
     name: str, robot: RecordedRobot, config: Any, runs: Path, run_dir: Path | None, page: bool = True
 ) -> StageFolder | None:
-    """Run a stage, then print its summary and the names of its files, and write the run's page.
+    """Run a stage, print its summary and the names of its files, and write the run's page.
 
     Args:
-        page: False: a later stage of the same command writes it.
+        page: Whether to write the page; otherwise a later stage of the same command writes it.
 
     Returns:
         The stage's folder; None in a training of several processes, where another process writes it.

@@ -1,1 +1,1 @@
-"""Emulated robots: servos on buses and legs, with firmware, physics, faults, truth. `hardware` never imports them."""
+"""Emulated robots: servos on buses, and legs, with firmware, physics, faults and true states."""

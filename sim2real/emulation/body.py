@@ -1,4 +1,4 @@
-"""A robot on legs in C MuJoCo, and rough ground: for the emulator, and to judge policies. Imports no JAX."""
+"""A robot on legs in C MuJoCo, and rough ground, for the emulator and for the judgement of policies. Without JAX."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ FLOOR = "floor"
 _BELOW_M = 0.5
 """Depth of the ground below its lowest point [m]."""
 _MARGIN_M = 14.0
-"""Ground around all starts: the way of a robot in an episode [m]."""
+"""Ground around all starts: how far a robot walks in an episode [m]."""
 
 
 @dataclass(frozen=True)
 class HeightField:
-    """Heights of the ground on a grid with its middle at x = y = 0, in triangles between grid points.
+    """Heights of the ground on a grid with its middle at x = y = 0; triangles connect the grid points.
 
     Attributes:
         heights: Shape ``(rows, columns)``: at each y and x [m]; the lowest is 0.
-        cell_m: Distance of grid points [m].
+        cell_m: Distance between grid points [m].
     """
 
     heights: np.ndarray
@@ -36,7 +36,7 @@ class HeightField:
 
     @property
     def size(self) -> tuple[float, float, float, float]:
-        """Half the lengths in x and y, the highest point, and the depth below, as MuJoCo needs them [m]."""
+        """MuJoCo's size of a height field: half the lengths in x and y, highest point, and depth below [m]."""
         rows, columns = self.heights.shape
         return (columns - 1) * self.cell_m / 2, (rows - 1) * self.cell_m / 2, float(self.heights.max()), _BELOW_M
 
@@ -44,12 +44,12 @@ class HeightField:
         """Return the height of the ground below places ``(..., 2)`` [m], shape ``(...)``."""
         xp = namespace(place)
         heights, (rows, columns) = xp.asarray(self.heights, dtype=np.float32), self.heights.shape
-        # Find the cell, and the place in it.
+        # Find the cell, and the position in it.
         grid = place / self.cell_m + xp.asarray([(columns - 1) / 2, (rows - 1) / 2], dtype=np.float32)
         cell = xp.clip(xp.floor(grid), 0, xp.asarray([columns - 2, rows - 2])).astype(np.int32)
         inside = xp.clip(grid - cell, 0.0, 1.0)
         (c, r), (u, v) = (cell[..., 0], cell[..., 1]), (inside[..., 0], inside[..., 1])
-        # MuJoCo cuts a cell from its lowest to its highest corner into two triangles.
+        # MuJoCo cuts a cell into two triangles, along the diagonal from its smallest to its largest x and y.
         low, high = heights[r, c], heights[r + 1, c + 1]
         side = xp.where(u > v, heights[r, c + 1], heights[r + 1, c])
         return low + xp.maximum(u, v) * (side - low) + xp.minimum(u, v) * (high - side)
@@ -59,8 +59,8 @@ class HeightField:
 class Terrain:
     """Ground of random heights, uniform and independent at the points of a grid.
 
-    A height field is the same in all copies of a program. So its roughness grows along x, and the x where an episode
-    starts sets the episode's roughness.
+    All copies of a program share one height field. So its roughness grows along x, and the x at which an episode starts
+    sets the episode's roughness.
 
     Attributes:
         most_m: Difference between the lowest and the highest point of the roughest ground [m].
@@ -88,19 +88,19 @@ class Terrain:
         return self._field(np.random.default_rng(seed), count, np.ones(count), roughness_m)
 
     def start_m(self, roughness_m: Scalar) -> Scalar:
-        """Return the x on the ground of a training that has a roughness [m]."""
+        """Return the x at which the ground of a training has a roughness [m]."""
         return (roughness_m / self.most_m - 0.5) * self.length_m
 
     def _field(self, rng: np.random.Generator, rows: int, share: np.ndarray, most_m: float) -> HeightField:
         heights = rng.random((rows, len(share))) * share
-        # MuJoCo scales heights to the range from 0 to 1.
+        # MuJoCo takes heights in the range from 0 to 1.
         heights = (heights - heights.min()) / np.ptp(heights)
         return HeightField((most_m * heights).astype(np.float32), self.cell_m)
 
 
 _mj: Any = mujoco
 _TOUCH_M = 0.03
-"""Radius of the volume in which a foot's contacts count [m]; a foot has 0.022 m."""
+"""Radius around a foot's site in which contacts belong to the foot [m]; a foot has 0.022 m."""
 
 
 @dataclass(frozen=True)
@@ -108,13 +108,14 @@ class HiddenTwin:
     """The hidden parameters of a body; no policy and no training reads them.
 
     Attributes:
-        friction: Of feet and floor.
-        load_kg: In the base.
+        friction: Friction of feet and floor.
+        load_kg: Load in the base.
         strength: Factor on the torque of each motor.
-        damping, dry, armature: Of each joint, or of all [N m s/rad], [N m], [kg m^2].
+        damping, dry, armature: Damping, dry friction and armature, of each joint or of all [N m s/rad], [N m], [kg
+            m^2].
         sensing_s: Time from the motion to the observation [s].
         acting_s: Time from the observation to the motors' new target: computation and transport [s].
-        bias_rad: Of each encoder.
+        bias_rad: Bias of each encoder.
     """
 
     friction: float = 0.8
@@ -154,11 +155,11 @@ def measured_dtype(motors: int) -> np.dtype:
 
 
 class LeggedBody:
-    """A robot of an MJCF file with hidden parameters, driven by motors with a law each; times count from its start.
+    """A robot of an MJCF file with hidden parameters; times count from its start.
 
-    Every geom collides, with elliptic cones. The torque of a motor is its law's, limited to the actuator's range, times
-    the motor's strength. The motor reports the torque of its law, as it does not know its strength. Its encoder has a
-    bias, for the law too.
+    Every geom collides, with elliptic cones. The torque of a motor is ``tau + kp (q - position) + kd (dq - velocity)``,
+    limited to the actuator's range, times the motor's strength. The motor reports the torque without its strength,
+    which it does not know. The bias of its encoder also acts on its controller.
 
     Args:
         mjcf: The model: one actuator for each joint with a motor, a site ``imu``, and a free joint of the base.
@@ -166,8 +167,8 @@ class LeggedBody:
         pose: Positions of the joints at the start [rad].
         height_m: Height of the base at the start [m].
         place: ``floor``, or ``stand``: the base is fixed, and the feet are in the air.
-        settle_s: Time in which the body comes to rest on the floor, with motors without torque [s].
-        ground: Heights in place of the model's floor; None: it is flat.
+        settle_s: Time in which the body comes to rest on the floor, without torque [s].
+        ground: Rough ground instead of the model's floor; None: the floor.
 
     Attributes:
         motors: Number of motors.
@@ -188,7 +189,7 @@ class LeggedBody:
         ground: HeightField | None = None,
     ) -> None:
         self.hidden, self.place, self.step_s = hidden, place, step_s
-        # The model, with what an IMU and the feet measure.
+        # The model, with sensors of an IMU and the feet.
         spec = _mj.MjSpec.from_file(str(mjcf))
         option = spec.option
         option.timestep, option.cone = step_s, _mj.mjtCone.mjCONE_ELLIPTIC
@@ -212,7 +213,7 @@ class LeggedBody:
         model = self.model = spec.compile()
         self.base, self.motors = model.body(base).id, int(model.nu)
         self._hide(model, hidden)
-        # The start: motors without torque until the first command.
+        # At the start, motors have no torque until the first command.
         data = self.data = _mj.MjData(model)
         self._measured = np.zeros((), measured_dtype(self.motors))
         data.qpos[-self.motors :] = pose
@@ -224,7 +225,7 @@ class LeggedBody:
         _mj.mj_forward(model, data)
 
     def drive(self, law: np.ndarray) -> None:
-        """Set the laws of all motors ``(motors, 5)``: q, dq, kp, kd, tau."""
+        """Set the command of all motors ``(motors, 5)``: q, dq, kp, kd, tau."""
         q, dq, kp, kd, tau = np.asarray(law, np.float64).T
         model, strength = self.model, np.asarray(self.hidden.strength)
         model.actuator_gainprm[:, 0] = strength * kp
@@ -243,13 +244,13 @@ class LeggedBody:
         measured["tau_est"] = data.actuator_force / self.hidden.strength
         measured["quaternion"] = data.xquat[self.base]
         measured["gyroscope"] = data.sensordata[:3]
-        # MuJoCo computes no acceleration of a body without joints to the world.
+        # MuJoCo computes no acceleration of a body that is fixed to the world.
         measured["accelerometer"] = data.sensordata[3:6] if self.place == "floor" else -self.model.opt.gravity
         measured["foot_force"] = data.sensordata[6:10]
         return measured
 
     def state(self) -> dict[str, float]:
-        """Return the true state: joints, orientation, rates and velocity of the base in its axes, and its height."""
+        """Return the true state: joints, and the base's orientation, height, and rates and velocity in its axes."""
         data, n = self.data, self.motors
         turn = data.xmat[self.base].reshape(3, 3)
         moving = data.qvel[:6] if self.place == "floor" else np.zeros(6)
@@ -268,7 +269,7 @@ class LeggedBody:
         return {name: np.asarray(value).tolist() for name, value in asdict(self.hidden).items()}
 
     def _hide(self, model: Any, hidden: HiddenTwin) -> None:
-        """Set the hidden parameters, and let MuJoCo compute the constants of the load."""
+        """Set the hidden parameters, and compute the constants that depend on the load."""
         before, motors, base = float(model.body_mass[self.base]), slice(model.nv - model.nu, None), self.base
         model.body_mass[base] = before + hidden.load_kg
         model.body_ipos[base] *= before / (before + hidden.load_kg)

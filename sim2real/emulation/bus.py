@@ -1,7 +1,7 @@
-"""Emulated motors on a half-duplex line, in planned time: settings and faults, the line, and the plant's clock.
+"""Emulated motors on a half-duplex line: settings, faults and timing; all times are computed, nothing waits.
 
-An instruction of n bytes that arrives at t is complete at max(t, wire free) + n * 10 / baud; the values that it reads
-are those of one sensing latency earlier, and its commands take effect one actuation latency later.
+An instruction of n bytes that arrives at t is complete at max(t, wire free) + n * 10 / baud. It reads values of one
+sensing latency earlier, and its commands take effect one actuation latency later.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ class BusEmulation(Emulation):
         baud_rate: Bits per second; a byte takes 10 bits.
         sensing_jitter_s: Half-width of the uniform variation of the sensing latency [s]; at most the latency.
         return_delay_us: The servos' Return Delay Time at power-up [us].
-        plant_step_s: Period of the grid on which the plant is stepped and commands take effect [s]; at most 1 ms.
-        wild: Probability that a read returns a position out of the motors' reach, with a correct checksum.
+        plant_step_s: Time step of the plant, at which commands take effect [s]; at most 1 ms.
+        wild: Probability that a read returns an impossible position, with a correct checksum.
         frozen_after_s: Time from which reads return the position of that time, and no velocity [s]; None: never.
         unplugged_after_s: Time at which the port goes away, as with a pulled USB plug [s]; None: never.
     """
@@ -62,7 +62,7 @@ class BusEmulation(Emulation):
         )
 
 
-_STALE_PACKET_NS: Final = 5_000_000  # after a longer pause, an incomplete packet is dropped
+_STALE_PACKET_NS: Final = 5_000_000  # an incomplete packet is dropped after a longer pause [ns]
 
 Sample = tuple[int, tuple[float, float, float]]
 """Time of the sample [ns], and position [rad], velocity [rad/s] and load."""
@@ -73,9 +73,9 @@ class Request:
     """A received instruction.
 
     Attributes:
-        t_ns: Time at which it was complete on the wire.
-        t_host_ns: Time at which its last bytes had reached the emulator.
-        actuation_ns: Delay until its commands take effect, the same for all motors; None until it is drawn.
+        t_ns: Time at which it was complete on the wire [ns].
+        t_host_ns: Time at which its last bytes had reached the emulator [ns].
+        actuation_ns: Delay until its commands take effect, the same for all motors [ns]; None until it is drawn.
     """
 
     packet: Any
@@ -108,7 +108,7 @@ class PlannedBus(PlannedRobot[B]):
 
     Args:
         send: Delivers the bytes of an answer to the host; returns False if the host cannot take them.
-        parser: Finds packets in chunks of bytes, as `Parser` does.
+        parser: A `Parser` of the family's packets.
         servos: Id -> firmware, ordered by id.
     """
 
@@ -149,11 +149,11 @@ class PlannedBus(PlannedRobot[B]):
         """Process bytes that the host has sent; `run_until(now_ns)` must be called next."""
         if self.is_silent(now_ns):
             return
-        # After a pause, the rest of an incomplete packet does not come any more.
+        # After a pause, the rest of an incomplete packet will not come.
         if now_ns - self._last_bytes_ns > _STALE_PACKET_NS:
             self._parser.clear()
         self._last_bytes_ns = now_ns
-        # Each instruction is executed when its last byte has passed the wire.
+        # Execute each instruction when its last byte has passed the wire.
         begin_ns = max(now_ns, self._wire_free_ns)
         self._wire_free_ns = begin_ns + round(len(chunk) * self._byte_ns)
         for packet, end in self._parser.feed(chunk):
@@ -169,7 +169,7 @@ class PlannedBus(PlannedRobot[B]):
     def run_until(self, t_ns: int) -> None:
         while (due_ns := self.next_due_ns()) is not None and due_ns <= t_ns:
             self._clock.advance(due_ns)
-            # Watchdogs first: an instruction that comes at the same time is too late.
+            # Watchdogs first: an instruction at the same time is too late.
             for servo in self._firmware.values():
                 deadline_ns = servo.watchdog_deadline_ns()
                 if deadline_ns is not None and deadline_ns <= due_ns:
@@ -262,7 +262,7 @@ class PlannedBus(PlannedRobot[B]):
             self._stop_motor(servo, t_ns, servo.command()[0])
 
     def _stop_motor(self, servo: Firmware, t_ns: int, mode: int) -> None:
-        """Stop the motor by its own firmware: at once, dropping commands that have not taken effect yet."""
+        """Let the firmware stop the motor at once, and drop commands that have not taken effect yet."""
         self._clock.cancel(servo.servo_id)
         self._clock.schedule(t_ns, 0, servo.servo_id, mode, 0.0)
 
@@ -323,13 +323,13 @@ class VirtualRobot(VirtualTime):
         return Guardian(lambda longest_s: VirtualChannel(self, motors, longest_s), silence_s)
 
     def feed(self, data: bytes) -> None:
-        """Send bytes to the servos, whoever has the port."""
+        """Send bytes to the servos, from the host or the guardian."""
         self._require_line()
         self.bus.feed(data, self._now_ns)
         self.bus.run_until(self._now_ns)
 
     def take_until(self, until_ns: int) -> bytes:
-        """Return the bytes that have arrived; none if there are none until a time [ns]."""
+        """Return the bytes that have arrived; wait for them until a time [ns]."""
         self._pass(until_ns, lambda: self._inbox)
         self._require_line()
         data = b"".join(self._inbox)
@@ -351,7 +351,7 @@ class VirtualRobot(VirtualTime):
 
 
 class _GuardLine:
-    """The port in virtual time, as the guardian's own code uses it; a `Line`."""
+    """The port in virtual time, for the guardian's code; a `Line`."""
 
     def __init__(self, robot: VirtualRobot) -> None:
         self.clock: Clock = robot
@@ -361,4 +361,4 @@ class _GuardLine:
         self._robot.feed(data)
 
     def read(self, until_ns: int) -> bytes:
-        return self._robot.take_until(max(until_ns, self._robot.now_ns() + 1))  # time goes on
+        return self._robot.take_until(max(until_ns, self._robot.now_ns() + 1))  # reading lets time pass

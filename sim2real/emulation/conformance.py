@@ -1,18 +1,17 @@
-"""A conformance suite for devices: runs the contract of a device on its emulator, in virtual time.
+"""Conformance tests of devices: check the contract of a device with its emulator, in virtual time.
 
 Fill in `make_device` in a test module of your own; pytest runs the rest:
 
     from sim2real.emulation.conformance import DeviceConformance
 
     class TestMyServos(DeviceConformance):
-        emulation = MyEmulation
-        plant = MyPlant
+        emulation = MyEmulation plant = MyPlant
 
         def make_device(self, port):
             return MyServos(port, ids=(1, 2))
 
-The device opens its port with `sim2real.hardware.bus.port.open_port` and waits on its `clock` alone, so that nothing in
-these tests takes real time or depends on the machine. A device that is not on a serial port defines `make_robot`
+The device opens its port with `sim2real.hardware.bus.port.open_port` and waits only on its `clock`, so that these tests
+take no real time and do not depend on the machine. For a device that is not on a serial port, define `make_robot`
 instead of `emulation` and `plant`.
 """
 
@@ -39,7 +38,7 @@ Started = Callable[..., tuple[VirtualTime, Device]]
 
 
 class DeviceConformance(ABC):
-    """The parts of the contract on which the rig relies; a subclass names the device and its emulator.
+    """Tests of the contract on which the rig relies; a subclass provides the device and its emulator.
 
     Attributes:
         emulation: The class of the emulator's settings.
@@ -48,7 +47,7 @@ class DeviceConformance(ABC):
         patience_s: Time in which a motor must be in the safe state after its host has died [s].
         safe_modes: Modes of a motor in the safe state.
         no_address: An address without a device.
-        silent_after_s: Age of an emulator that goes silent [s].
+        silent_after_s: Time after the emulator's start at which it goes silent [s].
     """
 
     emulation: ClassVar[type[BusEmulation]]
@@ -64,12 +63,12 @@ class DeviceConformance(ABC):
         """Return the device on a port, not opened yet, with a `silence_s` of 0.3 s to 1 s."""
 
     def make_robot(self, truth_path: Path, **settings: Any) -> VirtualTime:
-        """Return the emulator, started: latencies and faults have the names of `emulation.robot.Emulation`."""
+        """Return a running emulator; ``settings`` are fields of `emulation.robot.Emulation`."""
         config = self.emulation(**{**self.settings, **settings})
         return VirtualRobot(self.plant(), config, truth_path)
 
     def gate(self, device: Device) -> GateConfig:
-        """Return a gate that lets the command at rest pass; with columns: the whole reach."""
+        """Return a gate that admits the command at rest; for commands with columns, the whole reach."""
         kind = device.commanded
         if not kind.columns:
             return GateConfig(0.5, stale=kind.stale)
@@ -89,12 +88,12 @@ class DeviceConformance(ABC):
 
         yield begin
         for robot, device in zip(robots, devices, strict=True):
-            robot.kill_host()  # what a failed test has left open
+            robot.kill_host()  # close devices that a failed test has left open
             device.close()
             robot.stop()
 
     def play(self, device: Device, rest: np.ndarray, steps: int) -> list[Reading]:
-        """Command rest and measure, as a control loop does."""
+        """Measure and command rest, like a control loop."""
         readings = []
         for _ in range(steps):
             device.command(rest)
@@ -150,7 +149,7 @@ class DeviceConformance(ABC):
             readings = [device.measure() for _ in range(20)]
             end_ns = robot.clock.now_ns()
             done = device.counters
-        # Stamps increase, and lie within the session.
+        # Stamps increase, and lie within the time of the test.
         stamps = np.array([r.transaction.t_sent_ns for r in readings])
         assert begin_ns <= stamps[0]
         assert stamps[-1] <= end_ns
@@ -203,7 +202,7 @@ class DeviceConformance(ABC):
 
     @pytest.mark.parametrize("way", ["close", "exception", "make_safe", "in an instruction", "rig"])
     def test_every_way_out_takes_the_torque_off(self, start: Started, way: str) -> None:
-        """Also while an instruction waits for its answer; `make_safe` holds until the next `open`."""
+        """Every way of stopping takes the torque off, also during an instruction; `make_safe` holds until `open`."""
         robot, device = start()
         if way in ("rig", "exception"):
             with pytest.raises(ZeroDivisionError):
@@ -223,7 +222,7 @@ class DeviceConformance(ABC):
         self.require_safe(robot, device)
 
     def test_a_host_that_is_killed_leaves_no_torque(self, start: Started) -> None:
-        """The watcher outside of the process takes it off, or the motors themselves."""
+        """After the death of the host, its guardian or the motors themselves take the torque off."""
         robot, device = start()
         device.open()
         self.play(device, device.enable(), 10)
@@ -235,7 +234,7 @@ class DeviceConformance(ABC):
         assert (rows["t_ns"][-1] - killed_ns) * 1e-9 < self.patience_s
 
     def test_a_dry_run_moves_nothing(self, start: Started) -> None:
-        """A rig in a dry run drives no motor, and its bus is as busy."""
+        """A rig in a dry run drives no motor, and keeps its bus as busy."""
         robot, device = start()
         with Rig(device, self.gate(device)) as rig:
             rig.withhold_torque()
@@ -260,7 +259,7 @@ class DeviceConformance(ABC):
             raise ZeroDivisionError
 
     def _stop_in_an_instruction(self, device: Device, rest: np.ndarray) -> None:
-        """Make it safe from another thread, while this one waits on the device's clock."""
+        """Call `make_safe` from another thread, while this one waits on the device's clock."""
         clock = device.clock
         inner, left = clock.now_ns, [3]
 

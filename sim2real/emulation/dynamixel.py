@@ -1,4 +1,4 @@
-"""Emulated DYNAMIXEL X servos: what their firmware adds to the table."""
+"""Emulated DYNAMIXEL X servos: firmware beyond the table of registers."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class EmulatedServo(ServoFirmware):
         self.put(reg.BUS_WATCHDOG, -1)
 
     def switched_on(self) -> None:
-        """Set the goals to rest."""
+        """Set the goals to the present position."""
         self.put(reg.GOAL_PWM, 0)
         self.put(reg.GOAL_VELOCITY, 0)
         self.put(reg.GOAL_POSITION, self.get(reg.PRESENT_POSITION))
@@ -102,7 +102,7 @@ class EmulatedServo(ServoFirmware):
         if not register.writable or (register.eeprom and self.get(reg.TORQUE_ENABLE)):
             return StatusError.ACCESS
         if register in self.fixed and value != self.get(register):
-            return StatusError.RESULT_FAIL  # not emulated: other ids, baud rates and drive modes
+            return StatusError.RESULT_FAIL  # changes of ids, baud rates and drive modes are not emulated
         if register == reg.TORQUE_ENABLE and value and self.alert:
             return StatusError.RESULT_FAIL  # after a shutdown, torque can be switched on only after a reboot
         if not register.minimum <= value <= register.maximum:
@@ -129,7 +129,7 @@ class EmulatorConfig(ServoEmulation):
     """Settings of emulated DYNAMIXEL servos on their bus; see `Emulation` for the others.
 
     Args:
-        model_number: The servos' model number; their firmware behaves as that of the model.
+        model_number: The servos' model number, which determines their firmware.
         watchdog_stops: Whether a tripped bus watchdog stops the motor; None: as in the model's firmware.
     """
 

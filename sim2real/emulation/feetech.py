@@ -1,4 +1,4 @@
-"""Emulated Feetech servos: what their firmware adds to the table."""
+"""Emulated Feetech servos: firmware beyond the table of registers."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from sim2real.hardware.device import OperatingMode
 class StsServo(ServoFirmware):
     """Registers and firmware of one STS3215; see `ServoFirmware`.
 
-    A value out of range is dropped without an error, as its status packets carry none; so is a write to a read-only
-    register. EEPROM registers accept writes at any time; a value that was written while Lock is 1 is lost at the next
-    restart. Goals beyond the position limits are cut to them. An instruction with a wrong checksum gets no answer, as
-    the protocol has no error for it; nor a broadcast ping of several servos, whose answers would collide.
+    A value out of range, or a write to a read-only register, is dropped without an error: status packets have none for
+    it. EEPROM registers accept writes at any time; a value that was written while Lock is 1 is lost at the next
+    restart. Goals beyond the position limits are clipped. An instruction with a wrong checksum gets no answer, as the
+    protocol has no error for it; nor does a broadcast ping of several servos, whose answers would collide.
 
-    Two assumptions, not measured by us, are the worse case for a driver: writing a goal switches the torque on
+    Two assumptions, which we did not measure, are the worst case for a driver: writing a goal switches the torque on
     (`goal_wakes`), and after an alarm the motor is off while the torque register still holds 1. Not emulated: the
     remaining torque after an overload (Protective Torque), modes other than position, a limited acceleration of the
     setpoint, currents, other ids and baud rates.
@@ -50,7 +50,7 @@ class StsServo(ServoFirmware):
 
     @property
     def alert(self) -> int:
-        """The error byte of its status packets: the alarms."""
+        """The alarms, in the error byte of status packets."""
         return self.get(reg.STATUS)
 
     def command(self) -> tuple[int, float]:
@@ -60,7 +60,7 @@ class StsServo(ServoFirmware):
     def driven(self) -> tuple[int, float]:
         low, high = self.get(reg.MIN_POSITION), self.get(reg.MAX_POSITION)
         count = self.get(reg.GOAL_POSITION)
-        count = min(max(count, low), high) if (low, high) != (0, 0) else count  # 0 and 0: several turns
+        count = min(max(count, low), high) if (low, high) != (0, 0) else count  # both limits 0: several turns
         return OperatingMode.POSITION, (count - self.offset) * reg.RAD_PER_COUNT
 
     def controller(self) -> tuple[int, int, float]:
@@ -69,7 +69,7 @@ class StsServo(ServoFirmware):
         return *super().controller()[:2], math.inf if unlimited else count * reg.speed_unit_rad_s(phase)
 
     def refresh(self, position_rad: float, velocity_rad_s: float, load: float, tick_ms: int = 0) -> None:
-        """Set the registers of present values; it has no register of time."""
+        """Set the registers of present values; there is no register of time."""
         super().refresh(position_rad, velocity_rad_s, load)
         phase = self.get(reg.PHASE)
         if not phase & reg.PHASE_FULL_ANGLE:
@@ -77,7 +77,7 @@ class StsServo(ServoFirmware):
         self.put(reg.PRESENT_SPEED, round(velocity_rad_s / reg.speed_unit_rad_s(phase)))
 
     def written(self, register: Register, value: int) -> None:
-        """Keep what is written without the lock over a restart; a goal may switch the torque on."""
+        """Keep values that were written without the lock over a restart; a goal may switch the torque on."""
         if register.eeprom and not self.get(reg.LOCK):
             place = slice(register.address, register.end)
             self._saved = self._saved[: place.start] + register.encode(value) + self._saved[place.stop :]
@@ -96,7 +96,7 @@ class StsEmulation(ServoEmulation):
     """Settings of emulated STS3215 servos on their bus; see `ServoEmulation` for the others.
 
     Args:
-        goal_wakes: Whether writing a goal switches the torque on, the worse case for a driver.
+        goal_wakes: Whether writing a goal switches the torque on, the worst case for a driver.
         homing_offset: Offset that every servo subtracts from its encoder's count [counts].
     """
 

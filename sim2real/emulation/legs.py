@@ -1,7 +1,7 @@
-"""An emulated robot of Unitree: its motors and its IMU, and its connections in place of DDS.
+"""An emulated robot of Unitree: motors, IMU, and connections without DDS.
 
-A command that is written at t takes effect one actuation latency later, and a state holds the measurements of one
-sensing latency earlier.
+A command takes effect one actuation latency after it was written, and a state has the measurements of one sensing
+latency before.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ class UnitreeEmulation(Emulation):
     """Settings of an emulated robot of Unitree; see `Emulation` for the others.
 
     Args:
-        position_noise_rad: Deviation of the noise of encoders [rad].
-        velocity_noise_rad_s: Deviation of the noise of the motors' speeds [rad/s].
-        gyro_noise_rad_s: Deviation of the noise of the gyro [rad/s].
-        tilt_noise_rad: Deviation of the noise of the orientation, about each axis [rad].
-        accelerometer_noise_m_s2: Deviation of the noise of the accelerometer [m/s^2].
+        position_noise_rad: Standard deviation of the noise of encoders [rad].
+        velocity_noise_rad_s: Standard deviation of the noise of the motors' speeds [rad/s].
+        gyro_noise_rad_s: Standard deviation of the noise of the gyro [rad/s].
+        tilt_noise_rad: Standard deviation of the noise of the orientation, about each axis [rad].
+        accelerometer_noise_m_s2: Standard deviation of the noise of the accelerometer [m/s^2].
     """
 
     position_noise_rad: float = 0.0003
@@ -65,10 +65,10 @@ class UnitreeEmulation(Emulation):
 
 
 class EmulatedLegs(PlannedRobot[UnitreeEmulation]):
-    """Motors and IMU of a body. Without a host they go on as commanded last: the worst, as no reaction is documented.
+    """Motors and IMU of a body. Without a host, motors follow the last command: the worst case, as none is documented.
 
     Args:
-        send: Sends a state; None: nobody gets any.
+        send: Sends a state; None: states are not sent.
 
     Attributes:
         ignored: Commands whose CRC or head was wrong.
@@ -89,10 +89,10 @@ class EmulatedLegs(PlannedRobot[UnitreeEmulation]):
         self._coming: deque[tuple[int, int, np.ndarray, np.ndarray]] = deque()
         self._modes = np.zeros(body.motors, np.uint8)
         self.ignored = 0
-        # States that wait to be sent, until when they are held up, and when the next one is due.
+        # Delayed states, the end of the delay, and the time of the next state [ns].
         self._waiting: deque[tuple[LowState, int]] = deque()
         self._held_ns, self._due_ns = 0, _PERIOD_NS
-        # Measurements on the grid of the physics, the newest last, as far back as a state reaches.
+        # Measurements at the physics' time steps, newest last, as far back as a state reaches.
         self._dtype = body.measure().dtype
         depth = int(1e9 * config.sensing_latency_s) // self._step_ns + 3
         self._history: deque[np.ndarray] = deque(maxlen=depth)
@@ -105,14 +105,14 @@ class EmulatedLegs(PlannedRobot[UnitreeEmulation]):
     def run_until(self, t_ns: int) -> None:
         self.advance(t_ns)
         if t_ns >= self._due_ns:
-            # A process that was held up sends the newest state alone.
+            # After a pause of the process, send only the newest state.
             state_ns = t_ns - (t_ns - self._due_ns) % _PERIOD_NS
             self._due_ns = state_ns + _PERIOD_NS
             if not self.is_silent(t_ns):
                 self._send_state(state_ns)
 
     def receive(self, command: LowCmd, t_ns: int) -> None:
-        """Schedule a command that was written at ``t_ns``; one with a wrong CRC or head is ignored, as by the robot."""
+        """Schedule a command that was written at ``t_ns``; like the robot, ignore one with a wrong CRC or head."""
         record, config = command.record, self.config
         if tuple(record["head"]) != HEAD or record["level_flag"] != LOW_LEVEL or not command.intact:
             self.ignored += 1
@@ -128,8 +128,8 @@ class EmulatedLegs(PlannedRobot[UnitreeEmulation]):
     def advance(self, t_ns: int) -> None:
         """Integrate the body to the last grid point at or before a time [ns]."""
         while (now_ns := self._now_ns()) + self._step_ns <= t_ns:
-            # A command acts from the next grid point on, in the mean half a step late: the integrator moves a joint as
-            # if its force had acted half a step earlier.
+            # A command acts from the next grid point on, on average half a step late; this cancels the integrator,
+            # # which moves a joint as if its force had acted half a step earlier.
             while self._coming and self._coming[0][0] <= now_ns:
                 self._apply(*self._coming.popleft())
             self._body.step()
@@ -162,7 +162,7 @@ class EmulatedLegs(PlannedRobot[UnitreeEmulation]):
         return message
 
     def _send_state(self, state_ns: int) -> None:
-        """Send the state that is due, and those that were held up before it; or hold it up."""
+        """Send the due state, after delayed earlier states; or delay it."""
         config, chance = self.config, self._random.random
         if self._held_ns == 0 and chance() < config.late:
             self._held_ns = state_ns + round(1e9 * config.late_s)
@@ -181,7 +181,7 @@ class EmulatedLegs(PlannedRobot[UnitreeEmulation]):
             self.truth.write(Kind.LOSS if lost else Kind.SAMPLE, 0, sent_ns, sampled_ns, state_ns, state_ns - sent_ns)
 
     def _apply(self, effect_ns: int, t_ns: int, modes: np.ndarray, law: np.ndarray) -> None:
-        """Let a command act. A motor that is off has no torque; Unitree's two numbers take a controller out."""
+        """Apply a command. A motor that is off has no torque; `POS_STOP` and `VEL_STOP` switch a controller off."""
         q, dq, kp, kd = (law[:, COLUMNS.index(name)] for name in ("q", "dq", "kp", "kd"))
         kp[np.abs(q) >= 0.99 * NO_POSITION], kd[np.abs(dq) >= 0.99 * NO_VELOCITY] = 0.0, 0.0
         q[kp == 0.0], dq[kd == 0.0] = 0.0, 0.0
@@ -193,7 +193,7 @@ class EmulatedLegs(PlannedRobot[UnitreeEmulation]):
         if self.has(self.config.lets_go_after_s, self._now_ns()):
             driven[self.config.lets_go] = 0.0
         self._body.drive(driven)
-        # Mode, goal and position gain: of the first motor for each command, of the others if their mode changes.
+        # Log mode, goal and position gain: of the first motor for each command, of others if their mode changes.
         acts_ns, changed[0] = self._now_ns() - self._step_ns // 2, True
         for i in np.flatnonzero(changed).tolist():
             values = float(modes[i]), float(q[i]), float(kp[i])

@@ -1,4 +1,4 @@
-"""The physics of emulated robots: the protocol of a plant, the clock that steps a plant, and mountings."""
+"""The physics of emulated servos: the protocol of a plant, the clock that steps it, and mountings."""
 
 import heapq
 import math
@@ -14,21 +14,21 @@ STATE_PERIOD_S: Final = 0.005
 
 
 class Plant(Protocol):
-    """A mechanism driven by servos; used by the emulator alone, in one thread.
+    """A mechanism driven by servos; only the emulator uses it, in one thread.
 
     A plant need not inherit from this class. Times count from the emulator's start [s]; angles are those of the servos'
     output shafts [rad]. A plant that emulates the servos' position controllers also has ``configure(servo_id, p_gain,
-    d_gain, speed_rad_s)``: gains [counts], and the speed at which the setpoint moves to the goal. It is called at
-    time 0 for every servo with the power-up values, and whenever a write or a restart changes them.
+    d_gain, speed_rad_s)``: gains [counts], and the speed at which the setpoint moves to the goal. It is called at time
+    0 for every servo with the power-up values, and whenever a write or a restart changes them.
     """
 
     servo_ids: tuple[int, ...]
 
     def advance(self, t_s: float) -> None:
-        """Integrate up to a time [s], in fixed steps of at most 1 ms, with the last commands.
+        """Integrate up to a time [s], in fixed steps of at most 1 ms, under the last commands.
 
-        It is called with k * plant_step_s, k = 1, 2, ... The plant's own step must divide `plant_step_s`; to avoid
-        drift, make `round((t_s - now) / step)` steps.
+        Called with k * plant_step_s, k = 1, 2, ... The plant's step must divide `plant_step_s`; to avoid drift, make
+        `round((t_s - now) / step)` steps.
         """
         ...
 
@@ -57,7 +57,7 @@ class Plant(Protocol):
 class PlantClock:
     """Steps a plant on a fixed time grid, applies commands at grid points, and keeps a history of measurements.
 
-    The plant is never stepped past the requested time, so that no command can arrive for a time that has passed.
+    The plant is never stepped past the requested time, so that no command arrives for a time that has passed.
 
     Args:
         plant: The mechanism; must be at time 0.
@@ -94,11 +94,12 @@ class PlantClock:
             self._configure(servo_id, p_gain, d_gain, speed_rad_s)
 
     def schedule(self, t_ns: int, t_host_ns: int, servo_id: int, mode: int, goal: float) -> None:
-        """Schedule a command at the grid point nearest to a time; commands at one point apply in their order here.
+        """Schedule a command at the grid point nearest to a time; commands at one point apply in the order of calls.
 
         Args:
             t_ns: Time of its effect [ns].
-            t_host_ns: Time at which the emulator received it, for the truth log [ns]; 0: a command of the servo itself.
+            t_host_ns: Time at which the emulator received the command, for the truth log [ns]; 0: the servo's own
+                command.
         """
         index = max(round(t_ns / self._step_ns), self._index)
         self._sequence += 1
@@ -120,7 +121,7 @@ class PlantClock:
         before = max(before, self._index - self._depth + 2)
         position_rad, velocity_rad_s, load = self._history[before % self._depth][servo_id]
         share = max(0.0, place - before)
-        # Interpolate to the next grid point, or extrapolate where there is none yet.
+        # Interpolate to the next grid point, or extrapolate if there is none yet.
         if before == self._index:
             return position_rad + velocity_rad_s * share * self._step_ns * 1e-9, velocity_rad_s, load
         after = self._history[(before + 1) % self._depth][servo_id]
@@ -145,14 +146,14 @@ class PlantClock:
 
 
 class MountedPlant:
-    """A plant whose servos drive its joints through their mountings; see `sim2real.emulation.plant.Plant`.
+    """A plant whose servos drive its joints through mountings; see `sim2real.emulation.plant.Plant`.
 
-    The plant inside works on the joints' side: it gets their angles, speeds and voltages, and has their true states.
+    The inner plant computes with the joints' angles, speeds and voltages.
 
     Args:
         joints: One for each servo, in the order of the plant's `servo_ids`.
-        zero_rad: The encoder's angle from count 0 where the device reports 0 [rad]; in the plant inside, that of a
-            joint at 0.
+        zero_rad: Angle from the encoder's count 0 at which the device reports 0 [rad]; in the inner plant, the same for
+            a joint at 0.
 
     Raises:
         UsageError: There is another number of joints than of servos.

@@ -1,9 +1,9 @@
-"""What every emulated robot has, on a bus or over DDS: latencies, faults, planned and virtual time, and its truth.
+"""Shared code of emulated robots, on a bus or over DDS: latencies, faults, virtual time, and the log of true states.
 
-A robot is emulated in this process and in virtual time: no thread, no waiting, every instant exact. It is the clock of
-whoever drives it. Time goes on while the host waits for an answer or sleeps, event by event; it stands still while the
-host computes. The guardian is the guardian process's own code, without the process: it acts when it is due, and the
-host goes on when it has acted.
+A robot is emulated in this process and in virtual time: no thread, no waiting, every time exact. The robot is the clock
+of the program that drives it. Time passes while the host waits for an answer or sleeps, event by event; it stands still
+while the host computes. The guardian is the code of the guardian's process, called in this one: it acts when it is due,
+and then the host goes on.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ class Emulation:
     Args:
         sensing_latency_s: Age of a measurement when it is asked for, or when a state is sent [s].
         actuation_latency_s: Time from a command to its effect on the motors [s].
-        actuation_jitter_s: Half-width of the uniform variation of that time [s]; at most the latency. Commands take
-            effect in the order in which they were sent.
+        actuation_jitter_s: Half-width of the uniform variation of ``actuation_latency_s`` [s]; at most the latency.
+            Commands take effect in the order in which they were sent.
         reply_loss: Probability that an answer, or a state, is lost.
-        corrupt: Probability that it has a wrong checksum.
-        late: Probability that it is held up, as by a USB adapter; later ones wait for it.
-        late_s: Time for which it is held up [s].
+        corrupt: Probability that an answer, or a state, has a wrong checksum.
+        late: Probability that an answer, or a state, is late, as through a USB adapter; later ones wait for it.
+        late_s: Delay of a late answer or state [s].
         silent_after_s: Time from which nothing is received or sent, as with an unplugged cable [s]; None: never.
-        lets_go_after_s: Time from which the motor `lets_go` has no torque, though it reports torque on, as after
-            a gear broke [s]; None: never.
-        lets_go: That motor: a servo's id, or its place in the messages.
-        seed: Seed of jitter, noise and chances.
+        lets_go_after_s: Time from which the motor `lets_go` has no torque, although it reports torque on, as with a
+            broken gear [s]; None: never.
+        lets_go: The motor that fails: a servo's id, or its place in the messages.
+        seed: Seed of jitter, noise and faults.
     """
 
     sensing_latency_s: float = 0.0
@@ -67,7 +67,7 @@ class Emulation:
                 raise UsageError(f"emulator: {name} = {value} is below 0")
 
     def planned(self, physics: Any, truth: TruthLog, send: Callable[[Any], Any]) -> PlannedRobot[Any]:
-        """Return a robot without port and clock, with these settings and a plant or body.
+        """Return a robot with these settings and a plant or body, without port and clock.
 
         Args:
             send: Delivers the bytes of an answer, or a state, to the host; returns False if the host cannot take it.
@@ -118,11 +118,11 @@ class PlannedRobot(ABC, Generic[C]):
         """Process all events up to a time, in order."""
 
     def begin_faults(self, t_ns: int) -> None:
-        """Count the times of faults from a time."""
+        """Let the times of faults count from a time [ns]."""
         self.faulty_ns = t_ns
 
     def has(self, after_s: float | None, t_ns: int) -> bool:
-        """Return whether a fault that begins ``after_s`` [s] has begun at a time; None: it never does."""
+        """Return whether a fault that begins after a time [s] has begun; None: never."""
         return after_s is not None and t_ns - self.faulty_ns >= 1e9 * after_s
 
     def is_silent(self, t_ns: int) -> bool:
@@ -131,15 +131,15 @@ class PlannedRobot(ABC, Generic[C]):
 
 
 class VirtualTime:
-    """The clock of an emulated robot, its guardian, and the ends of its host.
+    """An emulated robot as a clock, with its guardian, and with ways in which its host can die.
 
     Attributes:
-        port: Its address.
-        clock: The robot itself.
-        planned: The robot in planned time.
-        reports: What the guardian told a person.
-        guardian_lives: False: the guardian's process has died.
-        host_lives: False: the host's process has died.
+        port: Address of the robot.
+        clock: This object.
+        planned: The robot without clock.
+        reports: Messages of the guardian to a person.
+        guardian_lives: Whether the guardian's process lives.
+        host_lives: Whether the host's process lives.
     """
 
     port: str
@@ -151,7 +151,8 @@ class VirtualTime:
         self.reports: list[str] = []
         self.guardian_lives = self.host_lives = True
         self._now_ns = 0
-        self._watchers: dict[threading.Event, list[Any]] = {}  # what is called, its period [ns], when it is due [ns]
+        # Repeated calls: function, period [ns], time of the next call [ns].
+        self._watchers: dict[threading.Event, list[Any]] = {}
         self._calling = False
         self._guard: Guard | None = None
         self._log = TruthLog(self.truth_path, truth_header(physics, config))
@@ -164,7 +165,7 @@ class VirtualTime:
         self.stop()
 
     def strike(self, **faults: Any) -> None:
-        """Let faults begin, or end, now; named as the fields of the settings."""
+        """Let faults begin, or end, now; ``faults`` are fields of the settings."""
         self.planned.config = replace(self.planned.config, **faults)
         self.planned.begin_faults(self._now_ns)
 
@@ -179,12 +180,12 @@ class VirtualTime:
         self.guardian_hears(b"")
 
     def guardian_hears(self, messages: bytes) -> None:
-        """Pass messages of the host to the guardian, which acts on them at once; none: the host has died."""
+        """Pass messages of the host to the guardian, which acts on them at once; empty: the host has died."""
         if self._guard is not None and self.guardian_lives:
             self._guard_acts(lambda guard: guard.hear(messages))
 
     def stop(self) -> None:
-        """End the robot, after which its truth is complete. May be called twice."""
+        """End the robot and complete its truth. May be called twice."""
         self._log.close()
 
     def truth(self) -> Truth:
@@ -196,7 +197,7 @@ class VirtualTime:
         return self._now_ns
 
     def sleep(self, duration_s: float) -> None:
-        """Let time pass [s]; what is repeated is called meanwhile."""
+        """Let time pass [s], with the calls that are to be repeated."""
         end_ns = self._now_ns + round(1e9 * duration_s)
         while True:
             for done in [done for done in self._watchers if done.is_set()]:
@@ -214,16 +215,16 @@ class VirtualTime:
         self._pass(end_ns)
 
     def repeat(self, call: Callable[[], None], period_s: float, done: threading.Event, name: str) -> None:
-        """Call a function in every `sleep`, from now on after each period, until ``done`` is set."""
+        """Call a function after each period, while time passes, until ``done`` is set."""
         del name
         self._watchers[done] = [call, round(1e9 * period_s), self._now_ns]
 
     def watch(self, guard: Guard | None) -> None:
-        """Let a guardian watch the host from now on, or none."""
+        """Let a guardian watch the host from now on; None: no guardian."""
         self._guard = guard
 
     def _pass(self, until_ns: int, arrived: Callable[[], object] = lambda: False) -> None:
-        """Let time pass, event by event, to a time [ns] or until something has arrived."""
+        """Let time pass, event by event, until a time [ns] or until ``arrived`` is true."""
         while not arrived():
             due = (t for t in (self.planned.next_due_ns(), self._guard_due_ns()) if t is not None)
             self._now_ns = max(self._now_ns, min(min(due, default=until_ns), until_ns))
@@ -235,7 +236,7 @@ class VirtualTime:
                 return
 
     def _guard_acts(self, act: Callable[[Guard], object]) -> None:
-        """Let the guardian do one thing; it hears and sees nothing else until that is done, though time passes."""
+        """Call a method of the guardian; until it returns, the guardian does nothing else, though time passes."""
         guard, self._guard = self._guard, None
         assert guard is not None
         try:
@@ -265,7 +266,7 @@ class VirtualChannel:
         self._robot.guardian_hears(message)
 
     def receive(self, until_ns: int) -> bytes | None:
-        """Return messages; None if there are none: the guardian answers at once, or never."""
+        """Return messages; None without messages, as the guardian answers at once or never."""
         del until_ns
         if not self._robot.guardian_lives:
             return b""
@@ -273,6 +274,6 @@ class VirtualChannel:
         return messages or None
 
     def close(self, wait_s: float) -> None:
-        if not wait_s:  # the host leaves without a word: as if it had died
+        if not wait_s:  # the host leaves without a message, as if it had died
             self._robot.guardian_hears(b"")
         self._robot.watch(None)

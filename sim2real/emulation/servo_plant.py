@@ -1,4 +1,4 @@
-"""Position servos on the joints of an MJCF, with hidden numbers: the physics of emulated arms, and of twins."""
+"""Position servos on the joints of an MJCF, with hidden parameters: the physics of emulated arms, and of twins."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -20,18 +20,18 @@ Each = float | Sequence[float]
 
 @dataclass(frozen=True)
 class ServoTruth:
-    """The hidden numbers of servos, at their joints.
+    """The hidden parameters of servos, at their joints.
 
     Attributes:
-        gain: Torque per error of position [N m/rad], at the P gain of the plant's ``p_gain``.
+        gain: Torque per error of position, at the P gain ``p_gain`` of the plant [N m/rad].
         limit: Torque at full duty [N m].
         damping: Back-EMF and viscous friction, while the winding is driven [N m s/rad].
-        damping_off: The same with torque off: an open winding has no back-EMF.
+        damping_off: Damping with torque off: an open winding has no back-EMF [N m s/rad].
         armature: Inertia of the rotor behind the gears [kg m^2].
         friction: Dry friction at speed [N m].
-        static: What friction at standstill exceeds that by [N m].
-        stribeck_rad_s: Speed at which 1/e of that is left [rad/s].
-        offset_rad: What a servo adds to its error of position [rad].
+        static: Additional friction at standstill [N m].
+        stribeck_rad_s: Speed at which 1/e of ``static`` is left [rad/s].
+        offset_rad: Constant that is added to the error of position [rad].
     """
 
     gain: Each
@@ -46,7 +46,7 @@ class ServoTruth:
 
 
 class ServoPlant:
-    """Servos in position mode, or PWM mode; any other mode is torque off. See ``sim2real.emulation.plant.Plant``.
+    """Servos in position or PWM mode; in other modes torque is off. See ``sim2real.emulation.plant.Plant``.
 
     The firmware moves its setpoint to the goal with limited speed, and computes the error in whole counts. D and I
     gains are not emulated.
@@ -55,17 +55,17 @@ class ServoPlant:
         mjcf: The model: its path, or its text.
         joints: Names of the joints, in the order of the servos.
         truth: Fields of ``ServoTruth``.
-        p_gain: Position P Gain that ``gain`` is given for [counts].
+        p_gain: Position P Gain to which ``gain`` refers [counts].
         names: Parameters that ``truth`` returns, such as ``gain`` or ``friction_JOINT``.
         zero_counts: Counts of the encoders while the joints are at 0; default: the centre of their range.
-        gears: Turns of each servo for one of its joint; default: 1. ``MountedPlant`` converts the angles.
+        gears: Turns of each servo for one turn of its joint; default: 1. ``MountedPlant`` converts the angles.
         start: Joint angles at the beginning [rad]; default: 0.
         carried_kg: Mass at the site ``tip`` [kg].
         contact: Whether bodies touch.
         step_s: MuJoCo's time step [s].
 
     Raises:
-        UsageError: The model has no joint of a name.
+        UsageError: The model lacks a joint.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class ServoPlant:
         self._p_gain, self._profile = [float(p_gain)] * n, [math.inf] * n
         self._mode, self._goal, self._reference = [int(OperatingMode.OFF)] * n, [0.0] * n, [0.0] * n
         self._torques = [0.0] * n
-        # Kept, as looking an array up in MuJoCo's structures costs as much as reading it.
+        # Keep the arrays: looking one up in MuJoCo's structures takes as long as reading it.
         self._qpos, self._qvel, self._applied = self.data.qpos, self.data.qvel, self.data.qfrc_applied
         self._friction, self._damping = self.model.dof_frictionloss, self.model.dof_damping
 
@@ -119,20 +119,20 @@ class ServoPlant:
             mj.mj_step(model, data)
 
     def forces(self, angles: list[float], speeds: list[float]) -> list[float]:
-        """Return the torques on the joints [N m] at angles and speeds: here those of the motors alone."""
+        """Return the torques on the joints at angles and speeds [N m]; default: the motors' torques."""
         del angles, speeds
         return self._torques
 
     def command(self, servo_id: int, mode: int, goal: float) -> None:
         """Set a servo's goal: rad from the encoder's count 0 (position), or the share of the supply voltage (PWM)."""
         i, position = self.servo_ids.index(servo_id), int(OperatingMode.POSITION)
-        # The setpoint starts from the present angle when this mode begins.
+        # The setpoint starts from the present angle when position mode begins.
         if mode == position and self._mode[i] != mode:
             self._reference[i] = float(self._qpos[self._at[i]])
         known = (position, int(OperatingMode.PWM))
         self._mode[i] = int(mode) if mode in known else int(OperatingMode.OFF)
         self._goal[i] = goal - self._zero_rad[i] if mode == position else goal
-        # The back-EMF brakes as damping does; there MuJoCo integrates it implicitly.
+        # The back-EMF acts as damping, which MuJoCo integrates implicitly.
         self._damping[self._dofs[i]] = (self._on if self._is_on(i) else self._off)[i]
 
     def configure(self, servo_id: int, p_gain: int, d_gain: int, profile_velocity_rad_s: float) -> None:
@@ -148,18 +148,18 @@ class ServoPlant:
         return float(self._qpos[self._at[i]]) + self._zero_rad[i], velocity, load
 
     def state(self) -> dict[str, float]:
-        """Return the true joint angles [rad] and velocities [rad/s], and where a site ``tip`` is [m]."""
+        """Return the true joint angles [rad] and velocities [rad/s], and the position of a site ``tip`` [m]."""
         rows = {"position": self._qpos[self._at], "velocity": self._qvel[self._dofs]}
         if mj.mj_name2id(self.model, mj.mjtObj.mjOBJ_SITE, "tip") >= 0:
-            mj.mj_kinematics(self.model, self.data)  # a step leaves the site where the step began
+            mj.mj_kinematics(self.model, self.data)  # after a step, positions of sites are those before it
             rows["tip"] = self.data.site("tip").xpos
         return {f"{name}[{i}]": value for name, row in rows.items() for i, value in enumerate(row.tolist())}
 
     def truth(self) -> dict[str, Any]:
-        """Return what a log can determine, at the servos' shafts, by the names of ``sim2real.robots.servo.model``.
+        """Return the true parameters at the servos' shafts, with the names of ``sim2real.robots.servo.model``.
 
-        The gain is that at ``p_gain``. Where friction decreases with speed in the robot's model, it is that at
-        standstill, otherwise that at speed.
+        The gain refers to ``p_gain``. Friction is the value at standstill if it decreases with speed in the robot's
+        model, otherwise the value at speed.
         """
         worn = any(name.startswith("stribeck") for name in self._names)
         friction = [f + s if worn else f for f, s in zip(self._at_speed, self._static, strict=True)]
@@ -183,7 +183,7 @@ class ServoPlant:
         return self._mode[i] != OperatingMode.OFF
 
     def _torque(self, i: int, angle: float, step_s: float) -> float:
-        """Return what the motor's duty makes of goal and angle, without back-EMF [N m]."""
+        """Return the motor's torque for goal and angle, without back-EMF [N m]."""
         if self._mode[i] == OperatingMode.PWM:
             return self._limit[i] * self._goal[i]
         if not self._is_on(i):
@@ -210,7 +210,7 @@ class ServoPlant:
             tip = spec.site("tip")
             body = tip.parent.add_body(name="carried", pos=tip.pos)
             body.explicitinertial, body.ipos, body.mass, body.inertia = True, [0.0] * 3, self._carried_kg, [1e-8] * 3
-        # Before it compiles: MuJoCo derives the stiffness of stops and friction from the rotors.
+        # Set rotors before compiling: MuJoCo derives the stiffness of stops and friction from them.
         for i, name in enumerate(self.joints):
             joint = spec.joint(name)
             joint.armature, joint.damping = self._armature[i], [self._off[i], 0.0, 0.0]

@@ -1,7 +1,7 @@
-"""Emulated servos of any family, made of its table: the firmware of one, and their bus, which carries out instructions.
+"""Emulated servos of any family: the firmware of a servo, made of the family's table, and the bus.
 
-As it is, a servo is a position servo that confirms what is written, drops what its registers cannot hold without an
-error, and has no watchdog. A family overrides what its firmware does differently.
+The base class is a position servo that confirms writes, drops invalid values without an error, and has no watchdog. A
+family overrides what its firmware does differently.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from sim2real.hardware.bus.packets import BROADCAST_ID, Instruction, Parser
 from sim2real.hardware.bus.registers import RETURN_DELAY_UNIT_S, Family, Register
 from sim2real.hardware.device import OperatingMode
 
-_DAMAGED: Final = 1  # an error of `refusal` that the family does not report
+_DAMAGED: Final = 1  # result of `refusal` for an error that the family does not report
 
 
 class ServoFirmware:
@@ -29,14 +29,14 @@ class ServoFirmware:
         return_delay_us: Return Delay Time at power-up, rounded to the register's unit of 2 us [us].
 
     Attributes:
-        heard_ns: Time of the last instruction that it received.
+        heard_ns: Time of the last instruction that it received [ns].
         watchdog_stops: Whether a tripped watchdog stops the motor.
-        atomic: Whether a write that is refused in part is refused as a whole, with an error.
-        offset_sign: Sign of the homing offset in what is read.
-        wild_counts: Range of positions out of the motor's reach.
+        atomic: Whether a write with one refused value is refused as a whole, with an error.
+        offset_sign: Sign of the homing offset in the position that is read.
+        wild_counts: Range of impossible positions [counts].
         answers_together: Whether several servos answer a broadcast ping, one after the other.
-        misunderstandings: Errors of a wrong checksum, of an unknown instruction, and of a READ of a wrong length;
-            none: it does not answer these.
+        misunderstandings: Errors for a wrong checksum, an unknown instruction, and a READ of a wrong length; none: it
+            does not answer them.
     """
 
     family: ClassVar[Family]
@@ -67,7 +67,7 @@ class ServoFirmware:
         self._memory[register.address : register.end] = register.encode(value)
         self._watchdog_ns = None
 
-    # What the bus asks
+    # -- called by the bus
 
     @property
     def return_delay_s(self) -> float:
@@ -76,12 +76,12 @@ class ServoFirmware:
 
     @property
     def answers_reads(self) -> bool:
-        """Whether it answers when it is read."""
+        """Whether it answers reads."""
         return True
 
     @property
     def confirms(self) -> bool:
-        """Whether it answers when it is written."""
+        """Whether it answers writes."""
         return True
 
     @property
@@ -101,7 +101,7 @@ class ServoFirmware:
     def write(self, address: int, data: bytes) -> tuple[int, bool]:
         """Write the registers that lie wholly within the data; return the error, and whether `command` may change.
 
-        A value that is refused is dropped; an `atomic` family then writes none, and reports the error.
+        A refused value is dropped; an `atomic` family then writes no value, and reports the error.
         """
         registers = self.family.registers.values()
         whole = [r for r in registers if address <= r.address and r.end <= address + len(data)]
@@ -126,7 +126,7 @@ class ServoFirmware:
             if not register.eeprom:
                 self.put(register, register.default)
 
-    # What the motor does
+    # -- the motor
 
     def command(self) -> tuple[int, float]:
         """Return mode and goal of the motor, as ``Plant.command`` takes them, according to the registers."""
@@ -138,7 +138,7 @@ class ServoFirmware:
 
     @property
     def offset(self) -> int:
-        """What its firmware adds to the encoder's count [counts]."""
+        """Offset that the firmware adds to the encoder's count [counts]."""
         return 0 if self.homing is None else self.offset_sign * self.get(self.homing)
 
     def controller(self) -> tuple[int, int, float]:
@@ -163,7 +163,7 @@ class ServoFirmware:
 
     def watchdog_deadline_ns(self) -> int | None:
         """Return the time at which its watchdog trips without an instruction; None if it has none, or it is off."""
-        if self._watchdog_ns is None:  # a register has changed; the bus asks at every event
+        if self._watchdog_ns is None:  # written out for speed: the bus calls this at every event
             watchdog, armed = self.family.watchdog, self.get(self.family.torque)
             limit = self.get(watchdog) * watchdog.unit if watchdog is not None and armed else 0.0
             self._watchdog_ns = max(round(1e9 * limit), 0)
@@ -172,10 +172,10 @@ class ServoFirmware:
     def trip_watchdog(self) -> None:
         """Trip the watchdog."""
 
-    # Where families differ
+    # -- overridden by families
 
     def refusal(self, register: Register, value: int) -> int:
-        """Return the firmware's error for a value, 0 if it takes it."""
+        """Return the firmware's error for a value, 0 if the value is valid."""
         taken = register.writable and register not in self.fixed and register.minimum <= value <= register.maximum
         return 0 if taken else _DAMAGED
 
@@ -188,7 +188,7 @@ class ServoFirmware:
         """React to a value that was written."""
 
     def switched_on(self) -> None:
-        """React to the torque, which has gone on."""
+        """React to torque that was switched on."""
 
 
 class ServoBus(PlannedBus["ServoEmulation"]):
@@ -235,7 +235,7 @@ class ServoBus(PlannedBus["ServoEmulation"]):
     def _answer(
         self, servo: ServoFirmware, request: Request, error: int, data: bytes = b"", sample: Sample | None = None
     ) -> None:
-        """Let a servo answer, with its measurement if the answer has present values, and with the line's faults."""
+        """Let a servo answer, with the line's faults; ``sample``: the measurement in the answer."""
         sender = servo.servo_id ^ 0x40 if self.happens(self.config.wrong_id) else servo.servo_id
         status = self.form.build_status(sender, error | servo.alert, data)
         status = status[:4] if self.happens(self.config.cut) else status
@@ -308,7 +308,7 @@ class ServoBus(PlannedBus["ServoEmulation"]):
 
 @dataclass(frozen=True)
 class ServoEmulation(BusEmulation, ABC):
-    """Settings of emulated servos on their bus; see `Emulation` and `BusEmulation` for the others.
+    """Settings of emulated servos on their bus; see `Emulation` and `BusEmulation` for further settings.
 
     Args:
         wrong_id: Probability that an answer has the id of another servo.

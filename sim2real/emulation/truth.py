@@ -1,7 +1,7 @@
-"""The emulator's log of true states and true latencies, the reference for other results.
+"""The emulator's log of true states and true latencies, with which tests and reports compare results.
 
-The file is one line of JSON (the header), followed by rows of fixed size, so that a file that was cut off can be read.
-All times are nanoseconds of the robot's clock.
+The file is one line of JSON (the header), followed by rows of fixed size, so that a truncated file can be read. All
+times are nanoseconds of the robot's clock.
 """
 
 import contextlib
@@ -30,9 +30,9 @@ class Kind(IntEnum):
         SAMPLE: An answered read of present values. `t_ns`: time of the sample; `t_done_ns`: time at which the host got
             the answer; `late_ns`: lateness against the plan. Values: position [rad], velocity [rad/s] and load, before
             quantisation.
-        EFFECT: A command took effect. `t_ns`: its time, a point of the plant's grid, of legs half a step before one, as
-            their integrator moves a joint; `late_ns`: lateness against the plan, possibly negative. Values: mode and
-            goal. `t_host_ns` is 0 for a command of the servo itself.
+        EFFECT: A command took effect. `t_ns`: when, at a time step of the plant; for legs half a step earlier, as their
+            integrator moves joints; `late_ns`: lateness against the plan, possibly negative. Values: mode and goal.
+            `t_host_ns` is 0 for the servo's own command.
         STATE: The plant's true state at `t_ns`. Values: in the order of the header's `state_names`.
         WATCHDOG: The bus watchdog tripped at `t_ns`.
         LOSS: An answer was lost; times as for SAMPLE.
@@ -63,7 +63,7 @@ def _dtype(values: int) -> np.dtype:
 
 
 class TruthLog:
-    """Appends rows to a truth file; where the file cannot be written it ends, and the emulated robot goes on.
+    """Appends rows to a truth file; if the file cannot be written, the log ends, and the emulated robot goes on.
 
     Args:
         path: The file; an existing one is replaced.
@@ -87,7 +87,7 @@ class TruthLog:
         late_ns: int,
         values: Sequence[float] = (),
     ) -> None:
-        """Write one row; see `Kind` for times and values. The ``servo_id`` of the whole plant is 0."""
+        """Write one row; see `Kind` for times and values. ``servo_id`` 0 stands for the whole plant."""
         padded = (*values, *self._padding[len(values) :])
         with contextlib.suppress(OSError):
             self._file.write(self._struct.pack(kind, servo_id, t_host_ns, t_ns, t_done_ns, late_ns, *padded))

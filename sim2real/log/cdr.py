@@ -43,10 +43,10 @@ class CdrField:
     """A value that differs between messages: a scalar, or an array of fixed shape in row-major order.
 
     Attributes:
-        dtype: Type of its elements.
+        dtype: Type of the elements.
         shape: ``()`` for a scalar.
         code: The element type's code in the module ``struct``.
-        python_type: The Python type that ``struct`` encodes without a loss, apart from its range.
+        python_type: The Python type whose numbers ``struct`` encodes without loss, if they are in range.
     """
 
     name: str
@@ -91,7 +91,7 @@ class Layout:
     ``pack`` encodes one message; ``np.frombuffer(data, layout.dtype)`` decodes any number of adjacent ones.
 
     Attributes:
-        fields: The fields among the parts, in the order in which ``pack`` takes their values.
+        fields: The fields among the parts, in the order of the values of ``pack``.
         dtype: A structured dtype of one message, encapsulation included.
         size: Size of a message [bytes].
     """
@@ -146,14 +146,14 @@ class Layout:
             )
         arguments: list[object] = list(self._template)
         for slot, part, value in zip(self._slots, self.fields, values, strict=True):
-            # A Python number of the field's own kind needs no array.
+            # A Python number of the field's type needs no array.
             plain = not part.shape and type(value) is part.python_type
             arguments[slot] = value if plain else _encoded(part, value)
         try:
             return self._struct.pack(*arguments)
         except (struct.error, OverflowError):
             for part, value in zip(self.fields, values, strict=True):
-                _encoded(part, value)  # raises the error that names the field
+                _encoded(part, value)  # `_encoded` raises an error that names the field
             raise
 
 
@@ -180,7 +180,7 @@ def _converted(part: CdrField, array: np.ndarray) -> np.ndarray:
     if from_kind == "f":
         lost = np.isinf(result) & ~np.isinf(array)
     elif to_kind == "f":
-        exact = 1 << (53 if part.code == "d" else 24)  # all integers up to here are exact
+        exact = 1 << (53 if part.code == "d" else 24)  # larger integers are not all exact
         lost = (array > exact) | (array < -exact) if from_kind != "b" else np.zeros(array.shape, bool)
         if lost.any():
             lost = np.reshape([int(r) != int(a) for r, a in zip(result.flat, array.flat, strict=True)], array.shape)

@@ -30,10 +30,10 @@ from sim2real.log.writer import LIBRARY
 from sim2real.types import Json
 
 _PREFIX = struct.Struct("<BQ")
-# Plain integers compare faster than enum members, and every record of a chunk is compared.
+# Plain integers: they compare faster than enum members, and every record of a chunk is compared.
 _MESSAGE, _CHANNEL = int(Opcode.MESSAGE), int(Opcode.CHANNEL)
 _BEGIN = len(MCAP0_MAGIC)
-# Sizes in a message record: opcode and length; then channel, sequence and two times.
+# Sizes in a message record [bytes]: opcode and length; then channel, sequence and two times.
 _MESSAGE_AT, _DATA_AT = 9, 31
 # After damage, reading resumes at a chunk or at the session's end. The search looks for the name of the chunk's
 # compression, which comes after the prefix, two times, a size and a checksum, or for the name of the session's end.
@@ -51,7 +51,7 @@ class TruncatedLogWarning(UserWarning):
 
 class _Record(NamedTuple):
     opcode: int
-    start: int  # of its content in the file
+    start: int  # of the record's content in the file
     end: int
 
 
@@ -59,17 +59,17 @@ class _Record(NamedTuple):
 class _Contents:
     """The content of a log file."""
 
-    library: str = ""  # that wrote the file, according to its header
+    library: str = ""  # name of the library that wrote the file, from its header
     session: dict[str, Json] | None = None  # the session's metadata; None if damaged
     end: dict[str, Json] | None = None  # the metadata written at the session's end; None after a crash
     attachments: dict[str, int] = field(default_factory=dict)  # name -> size [bytes]
     epoch_ns: int = 0  # wall clock at the episode's time 0; 0 if the episode never started
     channels: dict[int, Channel] = field(default_factory=dict)
-    messages: dict[int, list[bytes]] = field(default_factory=dict)  # of each channel, in the order of the file
+    messages: dict[int, list[bytes]] = field(default_factory=dict)  # messages of each channel, in the order of the file
     indexed: dict[int, int] = field(default_factory=dict)  # number of messages, according to the chunks' indices
     chunks: int = 0
-    last_log_time: int = 0  # of all chunks [ns]
-    skipped: list[str] = field(default_factory=list)  # descriptions of the unreadable places
+    last_log_time: int = 0  # first and last log time of all chunks [ns]
+    skipped: list[str] = field(default_factory=list)  # descriptions of unreadable parts
 
     def with_role(self, role: str) -> dict[int, Channel]:
         """Return the channels with a role: ``step``, ``output`` or ``input``."""
@@ -79,7 +79,7 @@ class _Contents:
         """Decode the messages of a channel, whose type has a fixed size.
 
         Args:
-            span: First and exclusive last log time [ns].
+            span: First log time, and end of log times (excluded) [ns].
 
         Returns:
             A structured array, shape ``(N,)``, ordered by sequence: ``sequence``, ``log_time`` and ``publish_time``
@@ -98,12 +98,12 @@ class _Contents:
         if any(len(m) != dtype.itemsize for m in messages):
             raise Sim2RealError(f"topic {self.channels[channel].topic} holds messages that do not fit its own fields")
         rows = np.frombuffer(b"".join(messages), dtype)
-        # Sort by sequence, as threads can write out of order.
+        # Sort by sequence, because threads may write out of order.
         rows = rows[(rows["log_time"] >= span[0]) & (rows["log_time"] < span[1])]
         return rows[np.argsort(rows["sequence"], kind="stable")]
 
     def take(self, data: mmap.mmap | bytes, record: _Record, opens_chunks: bool = True) -> None:
-        """Add a record, and the messages of a chunk if chunks are to be opened; describe a damaged one."""
+        """Add a record and, if ``opens_chunks``, the messages of a chunk; note a damaged record."""
         opcode, start, end = record
         try:
             if opcode == Opcode.CHUNK:
@@ -132,7 +132,7 @@ class _Contents:
                     self.end = decode(entry.metadata)
         except Sim2RealError:
             raise
-        except Exception as error:  # damaged bytes raise anything, and decompressors have their own exceptions
+        except Exception as error:  # damaged bytes may raise any exception
             name = Opcode(opcode).name.lower().replace("_", " ")
             self.skipped.append(f"a {name} of {end - start} bytes at {start} ({error})")
 
@@ -167,9 +167,9 @@ def read_log(path: str | Path, start_s: float | None = None, end_s: float | None
 
     The readable part of a damaged log is read, with a warning. The episode's metadata has the session's entries and
     ``log``, a dictionary with ``epoch_ns`` (wall clock at time 0), ``session_end`` (None after a crash),
-    ``attachments`` (names), ``first_seq`` (node -> number of its first step in the episode, 0 in a whole log),
-    ``missing_steps`` (node -> number of lost steps before the last one) and ``skipped`` (descriptions of the unreadable
-    places).
+    ``attachments`` (names), ``first_seq`` (node -> number of its first step in the episode, 0 in a complete log),
+    ``missing_steps`` (node -> number of lost steps before the last one) and ``skipped`` (descriptions of unreadable
+    parts).
 
     Args:
         start_s: Read steps that end, and messages that arrive, at this time or later [s from the episode's start];
@@ -180,11 +180,11 @@ def read_log(path: str | Path, start_s: float | None = None, end_s: float | None
         The episode. ``seq_in`` is -1 if the consuming step is not in the episode.
 
     Raises:
-        Sim2RealError: When the file is missing, not an MCAP file, not a log of sim2real, or cut off before the end of
-            its session metadata.
+        Sim2RealError: The file is missing, no MCAP file, no log of sim2real, or cut off before the end of its session
+            metadata.
 
     Warns:
-        TruncatedLogWarning: When the session has no end, or a part is unreadable.
+        TruncatedLogWarning: The session has no end, or a part is unreadable.
     """
     if start_s is not None and end_s is not None and not start_s <= end_s:
         raise UsageError(f"the range begins at {start_s} s, after its end at {end_s} s")
@@ -195,13 +195,13 @@ def read_log(path: str | Path, start_s: float | None = None, end_s: float | None
         steps, outputs, sequences = _steps_and_outputs(contents, (begin, end))
         messages = _connections(contents, (begin, end), sequences)
         units = _output_units(contents)
-    # Steps before the first one count as lost, unless the range starts later.
+    # Steps before the first read step count as lost, unless the range starts later.
     firsts = {node: int(s[0]) for node, s in sequences.items() if len(s)}
     missing = {
         node: int(s[-1]) + 1 - len(s) - (firsts[node] if start_s else 0) for node, s in sequences.items() if len(s)
     }
     _warn(path, contents, missing)
-    # Figures of the log beside the session's metadata.
+    # Add facts about the log to the session's metadata.
     log_metadata = {
         "epoch_ns": contents.epoch_ns,
         "session_end": contents.end,
@@ -224,7 +224,7 @@ def read_session(path: str | Path) -> dict[str, Json]:
     """Return the session's metadata, without reading steps and messages.
 
     Raises:
-        Sim2RealError: As ``read_log``, and when the metadata is damaged.
+        Sim2RealError: As ``read_log``, or the metadata is damaged.
     """
     session = _walk(path, opens_chunks=False).session
     if session is None:
@@ -259,9 +259,7 @@ def summary(path: str | Path) -> dict[str, Json]:
 
 
 class LogTail:
-    """The growing end of a log.
-
-    It only reads the file, so the process that writes the log is not aware of it.
+    """Reads the growing end of a log, without effect on the process that writes it.
 
     Args:
         path: The log, which exists and may be empty.
@@ -297,7 +295,7 @@ class LogTail:
                 return None
             if not data.startswith(MCAP0_MAGIC):
                 raise Sim2RealError(f"{self.path} is no MCAP file")
-        # Take the records that are whole; the next call reads the rest again.
+        # Take the complete records; the next call reads the rest again.
         position = 0 if self._position else _BEGIN
         with _readable_errors(self.path):
             while (record := _record(data, position)) is not None and record.opcode != Opcode.DATA_END:
@@ -309,7 +307,7 @@ class LogTail:
                 return None
             parts, outputs, _ = _steps_and_outputs(contents, _ALL)
             episode = Episode(parts, {}, outputs, contents.session or {}, complete=False, units=_output_units(contents))
-        # Keep the outputs whose step records are in the next chunk: the writer writes an output before its step.
+        # Keep outputs whose step records are in the next chunk: the writer writes an output before its step.
         counts = {c.metadata["node"]: len(contents.messages[n]) for n, c in steps.items()}
         for number, channel in contents.channels.items():
             waiting = contents.messages.get(number, [])
@@ -342,7 +340,7 @@ def _steps_and_outputs(
             number, channel = output_channels[node]
             described = json.loads(channel.metadata["fields"])
             values = contents.columns(number, layout_of_fields(described), span)
-            # Keep complete pairs: a step and its output can be in different chunks, and one chunk can be lost.
+            # Keep complete pairs: a step and its output may be in different chunks, one of which may be lost.
             _, in_steps, in_values = np.intersect1d(rows["sequence"], values["sequence"], return_indices=True)
             rows, values = rows[in_steps], values[in_values]
             for entry in described:
@@ -400,14 +398,14 @@ def _walk(path: str | Path, opens_chunks: bool = True) -> _Contents:
     """Read a log file once.
 
     Raises:
-        Sim2RealError: When the file is missing, not an MCAP file, not a log of sim2real, or cut off before the end of
-            its session metadata.
+        Sim2RealError: The file is missing, no MCAP file, no log of sim2real, or cut off before the end of its session
+            metadata.
     """
     contents = _Contents()
     with _readable_errors(path), _opened(path) as data:
         for record in _records(data, contents.skipped):
             contents.take(data, record, opens_chunks)
-    # Without the session's metadata, find the reason.
+    # If there is no session metadata, find out why.
     if contents.session is None:
         if contents.library not in ("", LIBRARY):
             raise Sim2RealError(
@@ -422,7 +420,7 @@ def _walk(path: str | Path, opens_chunks: bool = True) -> _Contents:
 
 @contextmanager
 def _readable_errors(path: str | Path) -> Iterator[None]:
-    """Convert the exceptions that damaged bytes cause in the block into an error about the file."""
+    """Convert exceptions that damaged bytes cause in the block to an error about the file."""
     try:
         yield
     except (Sim2RealError, OSError):
@@ -467,8 +465,8 @@ def _cut_before_session(path: str | Path) -> Sim2RealError:
 def _records(data: mmap.mmap, skipped: list[str]) -> Iterator[_Record]:
     """Yield the records of the data section without reading their content.
 
-    The length of each record leads to the next one. If a length is damaged, reading resumes at the next bytes that look
-    like a chunk or the session's end, and ``skipped`` gets the place.
+    The length of each record leads to the next record. If a length is damaged, reading resumes at the next bytes that
+    look like a chunk or the session's end, and the gap is noted in ``skipped``.
     """
     position = trusted = _BEGIN
     while position < len(data):
@@ -481,7 +479,7 @@ def _records(data: mmap.mmap, skipped: list[str]) -> Iterator[_Record]:
             elif record.opcode == Opcode.DATA_END:
                 return
             continue
-        # A damaged length can lead past good chunks: search from the end of the last record that is surely whole.
+        # A damaged length may lead past good chunks: search from the end of the last record that is surely complete.
         resume = _next_landmark(data, trusted)
         if resume is None:
             return
@@ -498,7 +496,8 @@ def _record(data: mmap.mmap | bytes, position: int) -> _Record | None:
     end = start + length
     if end > len(data) or not opcode:
         return None
-    # Check the lengths inside of chunks and message indices, which are most of a file; check the opcode of the others.
+    # Check the lengths inside of chunks and message indices, which are most of a file; check the opcode of other
+    # records.
     if opcode == Opcode.MESSAGE_INDEX:
         plausible = length >= 6 and length == 6 + int.from_bytes(data[start + 2 : start + 6], "little")
     elif opcode == Opcode.CHUNK:

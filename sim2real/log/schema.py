@@ -47,8 +47,8 @@ class JointSource:
 
     Attributes:
         topic: The topic of joint states; its layout has the names of this node's joints.
-        picks: For each of position, velocity and effort, ``(leaf, element)`` in the node's output for every joint; leaf
-            is -1 if the joint lacks the quantity. Empty if all joints lack the quantity.
+        picks: For each of position, velocity and effort: ``(leaf, element)`` of every joint in the node's output; leaf
+            is -1 if the joint lacks the quantity. Empty if all joints lack it.
     """
 
     topic: Topic
@@ -56,7 +56,7 @@ class JointSource:
 
 
 def snake(name: str) -> str:
-    """Return a name in the form that ROS requires: ``lower_snake_case``, starting with a letter."""
+    """Convert a name to ROS's form: ``lower_snake_case``, starting with a letter."""
     spaced = re.sub(r"([a-z0-9])([A-Z])", r"\1_\2", name)
     result = re.sub(r"[^A-Za-z0-9]+", "_", spaced).strip("_").lower()
     return result if result[:1].isalpha() else f"field_{result}".rstrip("_")
@@ -69,7 +69,7 @@ def output_topic(node: str, example: PyTree, units: Mapping[str, str] | None = N
         units: Field, or entry of one (``"aim[0]"``) -> unit.
 
     Raises:
-        Sim2RealError: When two leaves get the same name, or one has a dtype that ROS lacks.
+        Sim2RealError: Two leaves get the same name, or a leaf has a dtype that ROS lacks.
     """
     # Describe each leaf by name, type, shape and unit.
     arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(example).items()}
@@ -106,7 +106,7 @@ def layout_of_fields(described: Sequence[Mapping[str, Json]]) -> Layout:
 
 
 def units_of_fields(described: Sequence[Mapping[str, Json]]) -> dict[str, str]:
-    """Return field, or entry of one -> unit, from ``fields`` in a channel's metadata."""
+    """Return field or entry (``"aim[0]"``) -> unit, from ``fields`` in a channel's metadata."""
     units: dict[str, str] = {}
     for entry in described:
         unit, name = entry.get("unit"), entry["original"]
@@ -143,7 +143,7 @@ def joint_source(
         units: Field, or entry of one -> unit.
 
     Raises:
-        Sim2RealError: When a quantity, a field or an element does not exist.
+        Sim2RealError: A quantity, a field or an element does not exist.
     """
     quantities = ("position", "velocity", "effort")
     known: dict[str, tuple[int, int]] = {}
@@ -189,7 +189,7 @@ def unique_names(originals: Iterable[str], where: str, kind: str) -> dict[str, s
     """Return original name -> ROS name.
 
     Raises:
-        Sim2RealError: When two names become the same ROS name.
+        Sim2RealError: Two names become the same ROS name.
     """
     taken: dict[str, str] = {}
     for original in originals:
@@ -204,7 +204,7 @@ def unique_names(originals: Iterable[str], where: str, kind: str) -> dict[str, s
 
 
 def unit_of(name: str, units: Mapping[str, str]) -> str:
-    """Return the unit of a field, or of an entry of one, or an empty string."""
+    """Return the unit of a field, or of an entry such as ``aim[0]``; "" if it is unknown."""
     return units.get(name, units.get(name.partition("[")[0], ""))
 
 
@@ -215,7 +215,7 @@ def _unit(name: str, size: int, units: Mapping[str, str]) -> str | list[str]:
 
 
 def _scalars(units: Mapping[str, str]) -> str:
-    """Return ``fields`` of a channel whose fields are whole numbers."""
+    """Return the metadata ``fields`` of a channel whose fields are integers."""
     common = {"dtype": _INT64.str, "shape": list[int]()}
     return json.dumps([{"name": name, "original": name, **common, "unit": unit} for name, unit in units.items()])
 

@@ -1,6 +1,6 @@
-"""The session of a log: encoding of its metadata, and the ages of the inputs that its steps used.
+"""Metadata of a log's session, and the ages of the messages that its steps used.
 
-A metadata record holds a JSON document with a checksum, and its plain values for other viewers.
+A metadata record has a JSON document with a checksum, and its simple values for other viewers.
 """
 
 import dataclasses
@@ -24,11 +24,11 @@ FORMAT = 1
 def encode(name: str, document: Mapping[str, Json]) -> dict[str, str]:
     """Encode a document as the strings of an MCAP metadata record.
 
-    ``json`` is the whole document, and ``crc32`` its checksum, as MCAP has none for metadata. Top-level strings,
+    ``json`` is the whole document, and ``crc32`` its checksum, which MCAP lacks for metadata. Top-level strings,
     numbers and booleans are also stored under their names, for other viewers.
 
     Raises:
-        Sim2RealError: When a value cannot be written as JSON.
+        Sim2RealError: A value cannot be written as JSON.
     """
     try:
         text = json.dumps(dict(document), default=_plain)
@@ -42,7 +42,7 @@ def encode(name: str, document: Mapping[str, Json]) -> dict[str, str]:
 
 
 def _utf8(value: Json) -> str:
-    """Return a text that UTF-8 has: JSON escapes half a surrogate pair, as in names of files, and MCAP cannot."""
+    """Return a text that UTF-8 can encode: names of files may have single surrogates, which MCAP cannot store."""
     return str(value).encode("utf-8", "replace").decode()
 
 
@@ -50,7 +50,7 @@ def decode(record: Mapping[str, str]) -> dict[str, Json] | None:
     """Return the document of a metadata record; None if it is damaged.
 
     Raises:
-        Sim2RealError: When it was written in a newer format.
+        Sim2RealError: It was written in a newer format.
     """
     # A damaged record has another checksum.
     text = record.get("json")
@@ -63,7 +63,7 @@ def decode(record: Mapping[str, str]) -> dict[str, Json] | None:
         )
     try:
         document = json.loads(text)
-    except (ValueError, RecursionError):  # a file with a right checksum and no JSON: made on purpose
+    except (ValueError, RecursionError):  # a right checksum without JSON: a forged file
         return None
     return document if isinstance(document, dict) else None
 
@@ -80,13 +80,13 @@ def _plain(value: object) -> Json:
 
 
 def input_ages(episode: Episode, node: str) -> dict[str, np.ndarray]:
-    """Return the time from the sending of the newest used message to each step's start, by input.
+    """Return the age of the newest message at each step's start, by input.
 
     Ages show hiccups that step times do not show: punctual steps that use old messages.
 
     Returns:
-        Input -> ages ``(N,)`` [s]; NaN before the first message. Empty if the log lacks steps, as the step of a message
-        is then unknown.
+        Input -> ages ``(N,)`` [s]; NaN before the first message. Empty if steps are missing, because the step of a
+        message is then unknown.
     """
     log = episode.metadata.get("log", {})
     if log.get("missing_steps", {}).get(node):
@@ -107,5 +107,5 @@ def input_ages(episode: Episode, node: str) -> dict[str, np.ndarray]:
 
 
 def is_imported(episode: Episode) -> bool:
-    """Return whether an episode comes from another recorder's file, so that no lateness or computation was measured."""
+    """Return whether an episode was imported, so that neither lateness nor computation times were measured."""
     return "stamps" in episode.metadata

@@ -1,6 +1,6 @@
 """Writes a log: control threads put records into a queue, and one thread writes them to the file.
 
-The file's order keeps a crashed session readable: metadata and attachments are on the disk before the first data.
+Metadata and attachments are on the disk before the first data, so that a crashed session stays readable.
 """
 
 from __future__ import annotations
@@ -41,17 +41,17 @@ from sim2real.types import Json, PyTree
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-# A crash may cost at most 0.25 s of data: 0.1 s between two flushes, and 0.15 s for a writer thread that wakes late.
-# Flushing each 0.1 s makes the log 8 % larger than each 0.2 s.
+# A crash may cost at most 0.25 s of data: 0.1 s between two flushes, and 0.15 s for a writer thread that wakes late. #
+# Flushing every 0.1 s makes the log 8 % larger than every 0.2 s.
 FLUSH_PERIOD_S = 0.1
 SYNC_PERIOD_S = 1.0
-# `close` waits for the writer in steps of WAIT_S, reports its progress after every so many of them, and gives up if the
-# writer writes nothing for STUCK_S.
+# `close` waits for the writer in steps of WAIT_S, reports progress every few steps, and gives up if the writer writes #
+# nothing for STUCK_S.
 WAIT_S, REPORT_WAITS, STUCK_S = 0.2, 25, 60.0
-# Limit of the queue's memory [bytes], for a small computer too, and memory of a queued record without its arrays.
+# Largest memory of the queue, also on a small computer, and memory of a queued record without its arrays [bytes].
 MAX_QUEUE_BYTES, RECORD_BYTES = 1 << 28, 500
 LIBRARY = "sim2real"
-# Small, so that reading a range decompresses little, and a damaged byte costs little data.
+# Size of a chunk [bytes]: small, so that reading a range decompresses little, and a damaged byte costs little data.
 CHUNK_BYTES = 64 * 1024
 
 
@@ -60,7 +60,7 @@ class _Node:
     """The topics of one node.
 
     Attributes:
-        filled: Indices of the output's leaves with elements; empty leaves are not written.
+        filled: Indices of the output's leaves that are not empty; empty leaves are not written.
         joints: Source of its joint states, or None.
     """
 
@@ -148,12 +148,12 @@ class SessionFile:
             channel = self._writer.register_channel(topic.name, "cdr", schema, metadata)
             Channel(channel, topic.name, "cdr", metadata, schema).write(loose)
             self._channels[topic.name] = channel
-        # Write the definitions also before the first chunk, so that the loss of that chunk does not lose the others.
+        # Also write the definitions before the first chunk, so that the other chunks can be read if that one is lost.
         self._stream.write(loose.end())
 
     def step(self, record: StepRecord, leaves: Sequence[npt.ArrayLike]) -> None:
         """Write a step, its output and its joint states."""
-        # Refuse a node or an output that the session did not announce.
+        # Refuse a node or an output that the constructor did not get.
         node = self._nodes.get(record.node)
         if node is None:
             raise Sim2RealError(f"node {record.node!r} is not in this log. Available: {', '.join(self._nodes)}")
@@ -278,16 +278,16 @@ def _joint_state(source: JointSource, leaves: Sequence[npt.ArrayLike], time_ns: 
 class McapRecorder:
     """Writes one episode of a graph into one MCAP file; a ``Recorder``.
 
-    ``start``, ``step`` and ``message`` only queue: they never wait for the disk, and may be called
-    from any thread. The next call raises an error of the writer. As a context manager, it writes an exception that
-    leaves the block as the status of the session. If the process ends without ``close``, the status is ``aborted``.
+    ``start``, ``step`` and ``message`` only queue: they never wait for the disk, and may be called from any thread. If
+    writing fails, the next call raises the error. As a context manager, it stores an exception that leaves the block as
+    the session's status. If the process ends without ``close``, the status is ``aborted``.
 
-    A writer that falls behind loses no record, and ``close`` waits for it. The queue's memory has a limit: beyond it
-    every call raises an error, and the queued records are written.
+    If the disk is slow, records wait in memory, and ``close`` waits for them. Beyond a limit of memory every call
+    raises an error, and the queued records are still written.
 
     Args:
         path: The file; it must not exist.
-        metadata: Metadata of the session (pipeline, configuration, versions, ...), as JSON has it. The key ``log`` is
+        metadata: Metadata of the session (pipeline, configuration, versions, ...), as JSON values. The key ``log`` is
             reserved.
         attachments: File name -> content.
         outputs: Node -> an example of its output, such as ``init_output`` returns; all outputs must have its shapes.
@@ -296,8 +296,8 @@ class McapRecorder:
         units: Node -> field, or entry of one (``"aim[0]"``) -> unit.
 
     Raises:
-        Sim2RealError: When the file exists or cannot be created, the metadata cannot be written as JSON, two names get
-            the same ROS name, or an output has a dtype that ROS lacks.
+        Sim2RealError: The file exists or cannot be created, the metadata cannot be written as JSON, two names get the
+            same ROS name, or an output has a dtype that ROS lacks.
     """
 
     def __init__(
@@ -367,12 +367,12 @@ class McapRecorder:
         """Write all queued records and ``session_end``, and close the file. Later calls do nothing.
 
         Args:
-            status: End of the session, in a word or a sentence.
-            summary: More values for ``session_end`` (overruns, drops, ...), as JSON has them.
+            status: How the session ended, in a word or a sentence.
+            summary: More values for ``session_end`` (overruns, drops, ...), as JSON values.
             report: Called with the progress, a sentence, every few seconds.
 
         Raises:
-            Sim2RealError: When a record could not be written, or the disk has taken no data for a minute.
+            Sim2RealError: A record could not be written, or the disk has taken no data for a minute.
         """
         # Close once: the interpreter's exit can call this at the same time.
         with self._lock:
@@ -407,7 +407,7 @@ class McapRecorder:
             status = "interrupted" if isinstance(error, KeyboardInterrupt) else f"{type(error).__name__}: {error}"
             self.close(status, getattr(error, "exit_code", ERROR))
         except Sim2RealError as failure:
-            # The exception that left the block is raised; this one is added to it.
+            # Raise the exception that left the block, with this one as a note.
             error.add_note(str(failure))
 
     def _put(self, write: Callable[..., None], *arguments: Any) -> None:
@@ -482,14 +482,14 @@ _open_logs: set[McapRecorder] = set()
 
 @atexit.register
 def close_open_logs() -> None:
-    """Close the logs that are still open, as ``aborted``: the interpreter, or a command, ends."""
+    """Close the logs that are still open, as ``aborted``; called when the interpreter or a command ends."""
     for recorder in list(_open_logs):
-        with contextlib.suppress(Sim2RealError):  # nobody could read it any more
+        with contextlib.suppress(Sim2RealError):  # nobody could read the error any more
             recorder.close("aborted", ERROR)
 
 
 def _snapshot(node: str, output: PyTree, expected: dict[str, None]) -> list[PyTree]:
-    """Return the leaves of an output; writable numpy arrays are copied, as the caller may change them."""
+    """Return the leaves of an output; writable numpy arrays are copied, because the caller may change them."""
     if isinstance(output, Mapping) and output.keys() == expected.keys():
         leaves = [output[name] for name in expected]
     elif isinstance(output, Mapping) and expected and not any(isinstance(value, Mapping) for value in output.values()):

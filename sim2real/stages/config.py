@@ -16,7 +16,7 @@ MODEL_IDENTIFY = IdentifyConfig(
     max_delay_s=0.05,
     long_s=None,
 )
-"""Defaults of identify for a model, which has rough values: no search, initial states from the measurements."""
+"""Defaults of identify for a robot that a model describes: initial states are read from the measurements."""
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from sim2real.types import Json
 
 FORMATS = ("mjcf", "mjlab", "isaaclab", "json", "card")
 _PLAIN = {"gain", "stiffness", "damping", "viscous", "coulomb", "armature", "gravity", "delay"}
-"""Leaves of parameters that have a counterpart in MuJoCo's joints and drives."""
+"""Parts of parameter paths -> counterparts in MuJoCo's joints and drives."""
 _SESSION: tuple[str, ...] = ("firmware", "voltage", "temperature")
 """Facts about the hardware that a log may hold, in its metadata or as a measurement."""
 
@@ -83,7 +83,7 @@ def write_export(
     terms = exported and find_terms(identification, lambda values: _text(robot, {**off, **values}), sides)
     # Write the format: JSON and a card need no model, the others need one.
     if to in ("json", "card"):
-        about = about if to == "json" else [row for row in about if row[0] != "log"]  # no path of this machine
+        about = about if to == "json" else [row for row in about if row[0] != "log"]  # leave out paths of this machine
         document = json_document(identification, terms, find_delays(identification, sides), about)
         if to == "json":
             write_json(out, document)
@@ -121,7 +121,7 @@ def write_model_card(
         UsageError: The folder has files of something else.
     """
     if folder.is_file() or (folder.is_dir() and any(folder.iterdir()) and not (folder / "card.json").is_file()):
-        raise UsageError(f"{folder} is there and holds no model card", hint="name another folder with --out")
+        raise UsageError(f"{folder} exists and is no model card", hint="name another folder with --out")
     exported = robot.exported({p.name: p.nominal for p in model.parameters} | identification.values)
     plain = None if exported is None else exported.plain()
     card, signals = write_card(
@@ -148,7 +148,7 @@ def facts_of(episode: Episode, sensor: str) -> dict[str, str]:
     facts: dict[str, str] = dict.fromkeys(_SESSION, "not recorded")
     hardware = episode.metadata.get("hardware")
     facts |= {n: _of_motors(v) for n, v in hardware.items()} if isinstance(hardware, dict) else {}
-    # A measurement is better than the value at the begin of the recording, and has its place.
+    # A measurement replaces the value at the begin of the recording.
     for name, rows in episode.outputs.get(sensor, {}).items():
         for fact in _SESSION:
             if rows.size and fact in name:
@@ -159,7 +159,7 @@ def facts_of(episode: Episode, sensor: str) -> dict[str, str]:
 
 
 def _of_motors(values: Json) -> str:
-    """Return a fact of each motor as text: one value, or each value with its motors."""
+    """Return a fact about the motors as text: one value, or each value with its motors."""
     if not isinstance(values, dict):
         return str(values)
     motors: dict[str, list[str]] = {}
@@ -177,7 +177,7 @@ def _text(robot: RecordedRobot, values: Mapping[str, float]) -> str:
 
 
 def _no_model(identification: Identification, table: ParameterTable, to: str) -> UsageError:
-    """Return the error for a robot whose world is not MuJoCo's: it names what an MJCF would lack."""
+    """Return the error for a robot without a MuJoCo world, with the parameters that an MJCF would lack."""
     leaves = {p.name: str(p.leaf).rpartition(".")[2].partition("[")[0] for p in table if p.leaf}
     lost = [p.name for p in identification.parameters if leaves.get(p.name, "delay") not in _PLAIN]
     return UsageError(

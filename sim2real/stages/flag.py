@@ -1,4 +1,4 @@
-"""Flags of configurations: how a field appears on the command line, and flags of several stages. Imports no JAX."""
+"""How a field of a configuration appears on the command line, and checks of common flags. Imports no JAX."""
 
 import math
 from dataclasses import dataclass
@@ -14,10 +14,10 @@ class Flag:
     Attributes:
         metavar: Placeholder of the value in ``--help``; "": the type's.
         positional: Whether the value stands without a flag.
-        needed: Whether a command refuses to run without it.
+        needed: Whether the flag is required.
         flat: Whether the flags of a nested configuration have no prefix.
         also: A second name, such as ``--like``.
-        alone: Value of a flag that is written without one; None: it needs a value.
+        alone: Value of the flag if it is given without a value; None: a value is required.
     """
 
     metavar: str = ""
@@ -34,7 +34,7 @@ ViewFlag = Annotated[str | None, Flag("[web|ADDRESS|FILE.rrd]", alone=WINDOW)]
 
 
 def is_viewer(view: str) -> bool:
-    """Return whether a text names a viewer: ``window``, ``web``, an address, or a file of Rerun."""
+    """Return whether a text is a viewer: ``window``, ``web``, an address, or a file of Rerun."""
     return view == WINDOW or view.partition(":")[0] == "web" or "://" in view or view.endswith(".rrd")
 
 

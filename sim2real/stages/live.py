@@ -1,7 +1,7 @@
-"""A viewer beside a stage, for ``--view``: a process of its own shows the files that the stage writes.
+"""A live viewer for ``--view``: a separate process shows the files that a stage writes.
 
-The process runs at low priority. It shares no lock, no queue and no memory with the stage, so it cannot slow a control
-loop down except by the processor time that it takes.
+The process runs at low priority. It shares no lock, no queue and no memory with the stage, so it can slow a control
+loop down only by the processor time that it takes.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ if TYPE_CHECKING:
 _START_S = 30.0
 """Longest wait for the viewer, before torque goes on [s]."""
 _END_S, _LEAVE_S = 5.0, 1.0
-"""Longest waits for the last rows after the stage, and for the end of the process [s]."""
+"""Longest waits after the stage: for the last rows, and for the end of the process [s]."""
 _NICENESS = 10
 _READY, _WHOLE = "view:", "all rows are sent"
-"""The process's first line and its last one, if nothing goes wrong."""
+"""First and last line that the process prints, if nothing goes wrong."""
 
 
 def scene_of(robot: RecordedRobot) -> dict[str, Json]:
-    """Return what another process needs to draw a robot; empty if the robot has no model."""
+    """Return the data with which another process draws a robot; empty if the robot has no model."""
     if not isinstance(robot, Robot):
         return {}
     columns = {name: fields["position"] for name, fields in joint_columns(robot.drive.channels).items()}
     if (exported := robot.exported(robot.nominal())) is not None:
         return {"mjcf": exported.mjcf, "columns": columns}
-    file = getattr(robot, "mjcf", None)  # of a walking robot, which has no model for others
+    file = getattr(robot, "mjcf", None)  # a walking robot, whose model is not exported
     return {"mjcf": str(file) if file else None, "columns": columns}
 
 
@@ -64,7 +64,7 @@ def live_view(target: str | None, folder: Path, name: str, scene: Callable[[], M
 
     Args:
         target: Value of the flag ``--view``; None: no viewer.
-        name: Name of the application in the viewer, which keeps one arrangement for each.
+        name: Name of the application, under which the viewer stores the arrangement of its panels.
         scene: Returns the robot to draw in 3-D, see ``scene_of``.
     """
     if target is None:
@@ -73,7 +73,7 @@ def live_view(target: str | None, folder: Path, name: str, scene: Callable[[], M
     is_file = target.endswith(".rrd") and "://" not in target
     where = str(Path(target).absolute()) if is_file else target
     order = {"target": where, "folder": str(Path(folder).absolute()), "name": name, **scene()}
-    # In a session of its own, as Ctrl-C ends the stage, and the last rows come after it.
+    # In a new session: Ctrl-C must end only the stage, because the viewer still shows the last rows.
     process = subprocess.Popen(
         [sys.executable, "-m", "sim2real.stages.live"],
         stdin=subprocess.PIPE,
@@ -112,11 +112,11 @@ def _line(process: subprocess.Popen[str], wait_s: float) -> str:
     return out.readline().strip() if out is not None and select.select([out], [], [], wait_s)[0] else ""
 
 
-# -- the process: it feeds the viewer until its standard input closes; it prints a line at its start and one at its end
+# -- the process, which feeds the viewer until its standard input closes
 
 
 def main() -> None:
-    """Follow the folder that the first line of the standard input names."""
+    """Show the folder that the first line of the standard input names, while it grows."""
     from sim2real.view.live import PERIOD_S, Follower  # needs matplotlib, which a robot's computer lacks
 
     # The viewer inherits the priority: every other program comes first. Only Linux has the second one.

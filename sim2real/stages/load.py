@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 ENTRY_POINT_GROUP = "sim2real.pipelines"
 _PARENT = "sim2real_pipelines"
-"""Parent of the packages of folders, so that no top-level ``pipelines`` is needed."""
+"""Name of the package that contains the packages of pipeline folders."""
 
 AnyRobot: TypeAlias = "RecordedRobot | str"
 """A robot, or the name of its pipeline."""
@@ -46,7 +46,7 @@ def load_robot(name: str) -> RecordedRobot:
     package = _package(name)
     try:
         module = package if hasattr(package, "ROBOT") else load_module(name, "robot")
-    except TypeError as error:  # Python's own for a class that lacks methods of its contract
+    except TypeError as error:  # Python's error for a class that lacks methods of its contract
         if "abstract" not in str(error):
             raise
         hint = "sim2real.robots.robot describes each method"
@@ -54,7 +54,7 @@ def load_robot(name: str) -> RecordedRobot:
     from sim2real.robots.robot import checked  # imports JAX
 
     robot = checked(getattr(module, "ROBOT", None), f"pipeline {name!r} ({module.__file__})")
-    if robot.folder is not None and robot.name != name:  # the object of another pipeline
+    if robot.folder is not None and robot.name != name:  # the object belongs to another pipeline
         robot = copy.copy(robot)
     robot.name, robot.folder, robot.defaults = name, _folder(package), _defaults(package)
     return robot
@@ -66,7 +66,7 @@ def load_module(name: str, module: str) -> Any:
 
 
 def robot_of(robot: AnyRobot) -> RecordedRobot:
-    """Return a robot, or the one of a name."""
+    """Return a robot; load it if its name is given."""
     if isinstance(robot, str):
         return load_robot(robot)
     from sim2real.robots.robot import RecordedRobot, checked  # imports JAX
@@ -83,7 +83,7 @@ def moving(robot: RecordedRobot, world: str | None = None) -> Robot:
     """Return a robot for the stages that need hardware or training.
 
     Args:
-        world: World that it is simulated in; None: its own.
+        world: World in which it is simulated; None: its own.
 
     Raises:
         UsageError: The robot was only recorded.
@@ -94,14 +94,14 @@ def moving(robot: RecordedRobot, world: str | None = None) -> Robot:
     if not isinstance(robot, Robot):
         name = robot.name
         raise UsageError(
-            f"pipeline {name!r} is of recordings that somebody else made: there is no robot to record, train or deploy",
+            f"pipeline {name!r} has only recordings: there is no robot to record, train for or deploy to",
             hint=f"import a recording with `sim2real import FILE --pipeline {name}`, then `sim2real identify {name}`",
         )
     return robot
 
 
 def defaults_of(robot: AnyRobot) -> Defaults:
-    """Return the default settings of a robot's stages. By its name, the robot is not loaded: that imports JAX."""
+    """Return the default settings of a robot's stages; a name does not load the robot, which would import JAX."""
     if isinstance(robot, str):
         return _defaults(_package(robot))
     return robot.defaults or Defaults()
@@ -123,7 +123,7 @@ def shipped_policy(folder: Path | None) -> Path | None:
 
 
 def mapping_of(robot: RecordedRobot, path: Path) -> ImportMapping | None:
-    """Return the mapping with which a file of another recorder is read; None: it is a log, or there is none."""
+    """Return the mapping for a file of another recorder; None if the file is a log, or there is no mapping."""
     from sim2real.log.importing.bags import is_ours
     from sim2real.log.importing.mapping import MAPPING, load_mapping
 
@@ -138,7 +138,7 @@ def mapping_of(robot: RecordedRobot, path: Path) -> ImportMapping | None:
 
 def _folders() -> list[Path]:
     package = Path(__file__).resolve().parents[1]
-    # The wheel carries the pipelines inside the package; a checkout has them beside it.
+    # A wheel has the pipelines inside the package; a checkout has them next to it.
     return [f for f in (Path.cwd() / "pipelines", package / "_pipelines", package.parent / "pipelines") if f.is_dir()]
 
 
@@ -154,7 +154,7 @@ def _defaults(package: ModuleType) -> Defaults:
 
 
 def _package(name: str) -> ModuleType:
-    """Return the package of a pipeline; an ``__init__.py`` imports neither JAX nor MuJoCo.
+    """Return the package of a pipeline, whose ``__init__.py`` imports neither JAX nor MuJoCo.
 
     Raises:
         UsageError: There is no such pipeline.
@@ -187,7 +187,7 @@ def _import_folder(folder: Path) -> ModuleType:
     if name in sys.modules:
         if sys.modules[name].__file__ == str(path):
             return sys.modules[name]
-        # A folder of the same name was imported from elsewhere, e.g. another working directory: forget it.
+        # Forget a folder of the same name that was imported from elsewhere, e.g. another working directory.
         for stale in [m for m in sys.modules if m == name or m.startswith(f"{name}.")]:
             del sys.modules[stale]
     # Import the folder; a failed import leaves no module behind.

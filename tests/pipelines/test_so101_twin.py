@@ -40,7 +40,7 @@ def new(arm, answer, capsys, monkeypatch):
 def test_without_an_answer_nothing_moves_and_the_pipeline_is_there(arm, tmp_path, capsys, monkeypatch):
     code, told = new(arm, "", capsys, monkeypatch)
     assert (code, told.count(QUESTION)) == (2, 1), told
-    assert "there was no answer, so the arm was not recorded" in told
+    assert "Enter was not pressed, so the arm was not recorded" in told
     made = tmp_path / "pipelines" / "my_arm"
     assert json.loads((made / "calibration.json").read_text()) == json.loads(
         (SO101.folder / "calibration.json").read_text()

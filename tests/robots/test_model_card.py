@@ -189,7 +189,7 @@ def test_the_card_of_a_run(finished_run_dir, tmp_path, monkeypatch, capsys):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("mine")
     assert cli.main(["export", source, "--to", "card", "--out", "mine"]) == errors.USAGE
-    assert "holds no model card" in capsys.readouterr().err
+    assert "exists and is no model card" in capsys.readouterr().err
 
 
 def test_facts_about_the_hardware_come_from_the_log():

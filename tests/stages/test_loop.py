@@ -287,7 +287,7 @@ def test_a_robot_that_became_later_is_recorded_and_trained_for_anew(world):
 
 
 def test_the_loop_ends_as_a_deployment_does_that_is_refused_to_the_end(world):
-    with pytest.raises(UsageError, match="at least once"):
+    with pytest.raises(UsageError, match="iterations must be at least 1"):
         RunFlags(iterations=0)
     with pytest.raises(DelayChanged):
         world.go(LATER, iterations=1)

@@ -37,11 +37,11 @@ def is_ours(path: Path) -> bool:
 def read_bag(path: Path) -> Table:
     """Read the topics of a bag: ``/topic.field``, ``/topic.header.stamp`` and ``/topic.log_time`` [ns].
 
-    Joints are sorted by the names of the first message. Senders of one topic with other joints become ``/topic#2`` ...
+    Joints have the order of the first message. A sender on the same topic with other joints becomes ``/topic#2`` ...
 
     Raises:
-        UsageError: When there is no MCAP file, or its messages cannot be read; a container of another kind is named
-            with the command that converts it.
+        UsageError: There is no MCAP file, or its messages cannot be read; for other containers the error has the
+            command that converts them.
     """
     files = _files(path)
     topics: dict[str, _Topic] = {}
@@ -104,7 +104,7 @@ def _messages(path: Path, table: Table) -> Iterator[tuple[Channel, Schema | None
         while True:
             try:
                 record = next(records, None)
-            except Exception as error:  # decompressors have their own exceptions, and a cut file raises any of them
+            except Exception as error:  # decompressors raise their own exceptions, a cut file raises any of them
                 table.notes.append(
                     f"{path.name} is cut or damaged after {count} messages ({error}): the rest is left out"
                 )
@@ -142,7 +142,7 @@ class _Topic:
 
             try:
                 self._decode = DecoderFactory().decoder_for("cdr", schema) or json.loads
-            except Exception as error:  # of a definition that is incomplete
+            except Exception as error:  # the message definition is incomplete
                 self.why = f"its type {kind} cannot be read ({error})"
         elif encoding == "cdr":
             self.why = f"its schema is in {'' if schema is None else schema.encoding!r}, not in ros2msg"
@@ -160,7 +160,7 @@ class _Topic:
         row: dict[str, Any] = {}
         try:
             _flatten(self._decode(data), "", row)
-        except Exception as error:  # decoders have their own exceptions
+        except Exception as error:  # decoders raise their own exceptions
             self.why = f"a message cannot be decoded ({type(error).__name__}: {error})"
             return
         row["log_time"] = log_ns
@@ -177,7 +177,8 @@ class _Topic:
                 topic = f"{self.name}#{n}"
                 table.notes.append(f"{self.name} has several senders: {topic} has {', '.join(names) or 'no names'}")
             for key, value in rows[0].items():
-                if not isinstance(value[0] if isinstance(value, list) and value else value, str):  # frames and names
+                # Texts, such as frames and names.
+                if not isinstance(value[0] if isinstance(value, list) and value else value, str):
                     _add(table, f"{topic}.{key}", key, rows, names)
 
 
@@ -212,7 +213,7 @@ def _sorted(values: Any, own: list[str], names: list[str]) -> list[Any]:
 
 
 def _flatten(value: Any, trail: str, row: dict[str, Any]) -> None:
-    """Put the numbers of a message into a row by path; stamps become nanoseconds."""
+    """Put the numbers of a message into a row, by path; stamps become nanoseconds."""
     fields = value if isinstance(value, dict) else {k: getattr(value, k) for k in getattr(value, "__slots__", ())}
     for sec, nanosec in (("sec", "nanosec"), ("secs", "nsecs")):  # JSON has them in any order
         if set(fields) == {sec, nanosec}:

@@ -1,4 +1,4 @@
-"""Checks whether the data of an import agree with its mapping. They choose nothing: they confirm, ask or refuse.
+"""Checks whether the data of an import agree with its mapping; they refuse, ask or confirm, and never change it.
 
 Goals and measured positions in one unit are compared joint by joint: order, sign, lag, slope, copies, zeros, clocks.
 """
@@ -20,35 +20,36 @@ from sim2real.log.importing.names import meaning
 ndimage = Later("scipy.ndimage")
 TURN_RAD = 2.0 * np.pi
 _MAX_ROWS = 6000
-"""Compared rows; a longer recording is thinned."""
+"""Most compared rows; a longer recording is thinned."""
 _FINER = 4
-"""Compared rows for each sample, as a fast tone turns its sign within two samples."""
+"""Compared rows for each sample, because a fast sine changes its sign within two samples."""
 LEAST = 50
 """Fewest samples that can be checked."""
 _LAGS_S = (-0.3, 0.6)
 _CLOCK_LAGS_S = (-1.0, 1.5)
-"""Of parts, as a clock that was set changes the lag."""
+"""Number of parts that are compared one by one, because a clock that was set changes the lag."""
 _APART_S = 60.0
-"""Clocks that are set apart by up to this time are found."""
+"""Largest offset between two clocks that is found [s]."""
 _FOLLOWS_R = 0.8
-"""A position follows a command from this correlation on."""
+"""A position follows a command if their correlation is at least this."""
 _STILL = 2e-3
 """A joint with a smaller standard deviation does not move [rad or m]."""
 _CLOCK_S = 6.0
 """Shortest recording whose clocks are compared [s]."""
 _MOST_STEPS = 4
-"""A zero that moves more often is no zero."""
+"""Most steps of a joint's zero."""
 _FASTEST_RAD_S = 60.0
-"""Highest speed of a joint; a faster step is no motion."""
+"""Highest speed of a joint [rad/s]; a faster step is no motion."""
 
 Weight = Literal["refuse", "ask", "warn", "note"]
-"""``refuse``: data and mapping contradict each other; ``ask``: the data fit several mappings; ``warn``: true, and to be
-known; ``note``: evidence."""
+"""``refuse``: data and mapping contradict each other; ``ask``: the data fit several mappings; ``warn``: imported, but
+the user must know it; ``note``: evidence.
+"""
 
 
 @dataclass(frozen=True)
 class Check:
-    """What the data say about one joint, or about all.
+    """A finding of the data about one joint, or about all joints.
 
     Attributes:
         name: A key of ``CHECKS``.
@@ -63,7 +64,7 @@ class Check:
 
     @property
     def question(self) -> str:
-        """The key of a mapping that answers it; empty: the file is wrong, or the mapping in several keys."""
+        """The key of the mapping that answers it; empty: the file is wrong, or several keys of the mapping are."""
         return CHECKS[self.name][0]
 
 
@@ -84,11 +85,11 @@ CHECKS = {
     "rate": ("", "log both sides faster than the motion"),
     "still": ("", "move the joint"),
 }
-"""Name of a check -> the key of a mapping that answers it, and what else to do."""
+"""Name of a check -> the key of the mapping that answers it, and what else the user can do."""
 
 
 def hint_for(wrong: Sequence[Check]) -> str:
-    """Return what to do about checks that refuse an import."""
+    """Return a hint for checks that refuse an import."""
     hints = dict.fromkeys(CHECKS[c.name][1] or "correct the mapping" for c in wrong)
     return "; ".join(hints) + "; --as-told imports it all the same"
 
@@ -109,9 +110,9 @@ def check(
         goal: Shape ``(N, joints)`` [rad or m].
         position: Shape ``(M, joints)``, in the same unit.
         names: Names of the joints.
-        by_name: Whether names say which goal belongs to which position; else their order does, which must be evident.
+        by_name: Whether names assign goals to positions; otherwise their order does, and the data must confirm it.
         acting: Shape ``(N,)``: whether goals act; None: all do.
-        unit: Unit of both; empty for hinges beside slides.
+        unit: Unit of both; empty for a robot with hinges and slides.
     """
     found = respond(t_s, goal, position, acting)
     if found is None and (samples := min(map(len, t_s))) < LEAST:
@@ -135,7 +136,7 @@ def check(
     elif moving and not following and not opposed and (apart := _apart(t_s, goal[:, moving], position[:, moving])):
         findings = [f for f in findings if f.name not in ("follows", "lag")] + apart
     elif moving and not following and not any(f.weight in ("refuse", "ask") for f in findings):
-        rates = [replace(f, weight="refuse") for f in rates]  # the cause
+        rates = [replace(f, weight="refuse") for f in rates]  # the cause of other findings of other findings
         text = "no position follows its goal: units, signs, order and clocks are unproven"
         findings += [] if rates else [Check("follows", -1, text, "ask")]
     findings += clock
@@ -175,7 +176,7 @@ def check_episode(episode: Episode, joints: Sequence[str] = (), by_name: bool = 
 
 
 def slow_sides(episode: Episode) -> list[str]:
-    """Return a sentence if commands are logged too seldom for the motion of an episode, or the other way round."""
+    """Return a sentence if commands, or positions, are logged too seldom for the motion of an episode."""
     return [finding.text for finding in check_episode(episode) if finding.name == "rate"]
 
 
@@ -187,13 +188,13 @@ class Response(NamedTuple):
 
     lag_s: np.ndarray  # (L,)
     r: np.ndarray  # (L, joints, commands): correlation
-    slope: np.ndarray  # (L, joints, commands): of positions over commands
-    mean: tuple[np.ndarray, np.ndarray]  # of commands and positions, (joints,)
+    slope: np.ndarray  # (L, joints, commands): slope of positions over commands
+    mean: tuple[np.ndarray, np.ndarray]  # standard deviations of commands and positions, (joints,)
     spread: tuple[np.ndarray, np.ndarray]
-    sample_s: float  # time between samples of the faster side
+    sample_s: float  # period of the faster of the two streams
 
     def fit(self, sign: float, begin_s: float) -> Fit:
-        """Return how each position fits each command, or its opposite, at the best lag from a begin on."""
+        """Return how each position fits each command, or with ``sign`` -1 its negative, at the best lag."""
         rows = np.flatnonzero(self.lag_s >= begin_s)
         k = rows[np.argmax(sign * self.r[rows], axis=0)]
         r, slope = (np.take_along_axis(x, k[None], axis=0)[0] for x in (self.r, self.slope))
@@ -208,8 +209,8 @@ class Fit(NamedTuple):
 
     r: np.ndarray  # correlation
     lag_s: np.ndarray
-    slope: np.ndarray  # of positions over commands
-    misfit: np.ndarray  # error of the command as a prediction, over the spread of the position
+    slope: np.ndarray  # slope of positions over commands
+    misfit: np.ndarray  # error of the command as a prediction, relative to the position's standard deviation
 
 
 def respond(
@@ -226,7 +227,7 @@ def respond(
         command: Shape ``(N, joints)``.
         position: Shape ``(M, joints)``.
         acting: Shape ``(N,)``: whether commands act; None: all do.
-        lags_s: Least and largest lag [s].
+        lags_s: Smallest and largest lag [s].
     """
     grid, held, joined, live = _on_grid(t_s, command, position, acting, _FINER)
     sample_s = min(float(np.median(np.diff(t))) for t in t_s)
@@ -236,7 +237,7 @@ def respond(
     lags = np.arange(round(lags_s[0] / period_s), round(lags_s[1] / period_s) + 1)
     least = round(50 * sample_s / period_s)
     lags = lags[np.abs(lags) < len(grid) - least]
-    # At a lag, sum over the rows at which both the command then and the position now are known: by FFT, for all lags.
+    # For each lag, sum over the rows where both the earlier command and the position are known; by FFT, for all lags.
     mean, spread = ([f(x[live], axis=0) for x in (held, joined)] for f in (np.mean, np.std))
     c, q = (np.where(live[:, None], x - m, 0.0) for x, m in zip((held, joined), mean, strict=True))
     size = 1 << (2 * len(grid) - 1).bit_length()
@@ -259,14 +260,14 @@ def _judge(
     found: Response, fits: tuple[Fit, Fit, Fit], i: int, names: Sequence[str], by_name: bool,
     t_s: tuple[np.ndarray, np.ndarray], goal: np.ndarray, position: np.ndarray,
 ) -> tuple[Check | None, bool]:  # fmt: skip
-    """Return what a joint's goals and positions contradict, None if it follows; and whether it moves.
+    """Return the finding about a joint's goals and positions, None if it follows; and whether it moves.
 
     Args:
-        fits: To goals, and to their opposites, at lags after them; to goals, also at lags before them.
+        fits: Fits of positions to earlier goals, to earlier negative goals, and to goals at any lag.
     """
     name, (own, opposite, leading) = names[i], fits
     moves = bool(min(s[i] for s in found.spread) > _STILL)
-    # A joint that is held: where, and by which goal. A weak servo sags, by less than half of its goal.
+    # A resting joint: compare its position and goal. A weak servo sags, by less than half of its goal.
     level, held = float(np.median(position[:, i])), float(np.median(goal[:, i]))
     is_elsewhere = (
         not moves and np.ptp(goal[:, i]) < 4 * _STILL and abs(held) > 0.1 and abs(level - held) > abs(held) / 2
@@ -274,13 +275,13 @@ def _judge(
     r, against = float(own.r[i, i]), float(opposite.r[i, i])
     best, slope = max(r, -against), float(own.slope[i, i] if r > -against else -opposite.slope[i, i])
     misfit, mirror = float(own.misfit[i, i]), float(opposite.misfit[i, i])
-    # The sign is 0 if both fit: a tone half a period later is its opposite.
+    # The sign is 0 if both fit: a sine half a period later is its negative.
     sign = _is_clear(r, -against, misfit, mirror) - _is_clear(-against, r, mirror, misfit)
     lead_r, lead_s = float(leading.r[i, i]), float(leading.lag_s[i, i])
     leads = lead_r > 0.9
     if best >= _FOLLOWS_R:
         leads = -lead_s > 1.5 * found.sample_s and 1 - r > 3 * (1 - lead_r) + 0.005
-    # The goals of other joints, apart from those that equal its own, or its opposite.
+    # Compare with goals of other joints, except goals equal to this joint's goal or its negative.
     mine = goal[:, i : i + 1]
     unlike = moves & ~np.any([np.isclose(mine, s * goal, 1e-6, 1e-9).all(axis=0) for s in (1, -1)], axis=0)
     others = np.where(unlike, np.maximum(own.r[i], -opposite.r[i]), 0.0)
@@ -308,7 +309,7 @@ def _judge(
         ("lag", "refuse", best < _FOLLOWS_R and leads, before),
         ("follows", "warn", best < _FOLLOWS_R,
          f"{name} does not follow its goal (r {best:.2f} at most): sign, unit and order are not checked"),
-        # A weak servo stays far behind its goal, but no servo goes far beyond it.
+        # A weak servo stays far short of its goal, but no servo goes far beyond it.
         ("slope", "refuse", not 0.15 < slope < 4.0, scale),
         ("sign", "refuse", sign < 0, f"{name} moves against its goal (r {against:.2f}): a sign of scale is wrong"),
         ("slope", "ask", sign > 0 and not 0.5 < slope < 1.6, scale),
@@ -325,7 +326,7 @@ def _rests(found: Response, i: int) -> str:
 
 
 def _is_clear(r: float, other_r: float, misfit: float, other_misfit: float) -> bool:
-    """Return whether a goal fits clearly better than another one: by its shape, or by its level."""
+    """Return whether a goal fits clearly better than another goal: by its correlation, or by its misfit."""
     by_level = misfit < 0.5 * other_misfit and other_misfit > 0.1
     return 1 - other_r > 3 * (1 - r) + 0.02 or (by_level and r > _FOLLOWS_R)
 
@@ -364,14 +365,14 @@ def _clock(
         if part is None:
             continue
         for k, joint in enumerate(joints):
-            # A motion that repeats fits at many lags: take one next to that of the part before, if it fits.
+            # A periodic motion fits at many lags: prefer a lag near that of the part before.
             known = lags[np.isfinite(lags[:, k]), k]
             last, r = known[-1] if len(known) else lag_s[joint], part.r[:, k, k]
             best = int(np.argmax(r if last is None else np.where(np.abs(part.lag_s - last) < 0.15, r, -1.0)))
             best = best if r[best] > 0.9 else int(np.argmax(r))
             if r[best] > 0.9 and min(s[k] for s in part.spread) > _STILL:
                 lags[row, k], curves[row, k] = part.lag_s[best], (part.lag_s, r)
-    # One rate for all joints, each of which has a lag of its own.
+    # Fit one clock rate for all joints, and one lag for each joint.
     known = [(row, k) for row, k in curves if np.isfinite(lags[:, k]).mean() > 0.7]
     if not known:
         return []
@@ -381,7 +382,7 @@ def _clock(
     seconds = seconds - middle
     rate = float(seconds @ (found - usual) / (seconds @ seconds))
     rest = found - usual - rate * seconds
-    # A slow motion fits its usual lag as well.
+    # A slow motion also fits its usual lag.
     best, fixed = (
         np.mean([1 - np.interp(lag, *curves[at]) for at, lag in zip(known, x, strict=True)]) for x in (found, usual)
     )
@@ -395,7 +396,7 @@ def _clock(
             " the clocks of the two streams run at different rates"
         )
     else:
-        # Or it steps once.
+        # Or the lag steps once.
         sides = [(found[rows < m], found[rows >= m], m) for m in range(1, count)]
         fitting = [(float(np.var(a) * a.size + np.var(b) * b.size), m) for a, b, m in sides if a.size and b.size]
         if not fitting:
@@ -408,12 +409,12 @@ def _clock(
             f"the lag of positions behind goals changes by {1e3 * grown:.0f} ms about {parts[m][0] - t_s[1][0]:.0f} s "
             "after the start: one of the two clocks was set"
         )
-    # The lag of a servo also changes with the frequency of a sweep, by less.
+    # In a sweep, the lag of a servo also changes with the frequency, but less.
     return [Check("clock", -1, text, "refuse" if abs(grown) > 0.15 else "warn")]
 
 
 def _apart(t_s: tuple[np.ndarray, np.ndarray], goal: np.ndarray, position: np.ndarray) -> list[Check]:
-    """Return a finding if positions follow their goals at a lag that no robot has: the clocks are set apart."""
+    """Return a finding if positions follow their goals at an impossible lag: the clocks have an offset."""
     span_s = min(_APART_S, 0.4 * (min(t[-1] for t in t_s) - max(t[0] for t in t_s)))
     found = respond(t_s, goal, position, lags_s=(-span_s, span_s))
     if found is None or span_s < 2 * _LAGS_S[1]:
@@ -436,13 +437,13 @@ def _zero(
     """Return findings on a zero that steps, or an offset between goal and position.
 
     Args:
-        lag_s: By how much the position follows its goal [s]; None if it does not: then only steps are looked for.
+        lag_s: Lag of the position behind its goal [s]; None if it does not follow: then only steps are looked for.
         unit: Unit of both.
     """
-    one = 0.1 if unit == "m" else 1.0  # what a radian is to a hinge, 0.1 m is to a slide
+    one = 0.1 if unit == "m" else 1.0  # thresholds in rad for a hinge hold for a slide with 0.1 m for 1 rad
     grid, held, joined, _ = _on_grid(t_s, goal[:, None], position[:, None], None)
     n, period_s = len(grid), float(grid[1] - grid[0])
-    # Predict the position from the last goals; the rest shows the zero.
+    # Predict the position from the last goals; the error shows the zero.
     span = max(1, round(((lag_s or 0.2) + 0.3) / period_s / 12))
     if n - 12 * span < 200:
         return []
@@ -450,7 +451,7 @@ def _zero(
     q, at, rows = joined[12 * span :, 0], grid[12 * span :], np.arange(n - 12 * span)
 
     def fitted(steps: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the sizes of the steps, and what goals and steps leave of the positions."""
+        """Return the sizes of the steps, and the positions minus goals and steps."""
         known = np.concatenate([past, rows[:, None] >= np.asarray(steps, int)[None, :]], axis=1)
         known = known - known.mean(axis=0)
         gram = known.T @ known
@@ -458,14 +459,14 @@ def _zero(
         weights = np.linalg.solve(gram, known.T @ (q - q.mean()))
         return weights[13:], q - q.mean() - known @ weights
 
-    # Add the step that explains most of the rest, up to a few: slips, or zeros that move.
+    # Add the step that explains most of the error, up to a few steps: slips, or moving zeros.
     steps: list[int] = []
     _, rest = fitted(steps)
     first, edge = float(rest.std()), max(len(q) // 20, 1)
     for _ in range(_MOST_STEPS):
         total, count = np.cumsum(rest), rows + 1.0
         far = int(np.argmax((np.abs(total) / np.sqrt(count * (len(q) - count) + 1.0))[edge:-edge])) + edge + 1
-        # A step of the goals can hide what follows them.
+        # A step of the goals can hide a step of the zero.
         leapt = int(np.argmax(np.abs(np.diff(past[edge:-edge, 0])))) + edge + 1
         near = {m for k in (far, leapt) for m in range(max(k - 3, 1), min(k + 4, len(q) - 1))} - {*steps}
         left, k = min(((float(fitted([*steps, m])[1].std()), m) for m in near), default=(np.inf, 0))
@@ -473,7 +474,7 @@ def _zero(
             break
         steps.append(k)
         _, rest = fitted(steps)
-    # A slip is several small steps, or one.
+    # A slip is one step, or several small steps.
     for chosen in (steps, steps[:1]):
         sizes, rest = fitted(chosen)
         blocks = np.array([b.mean() for b in np.array_split(rest, max(8, int(np.ptp(at) / 1.0)))])
@@ -499,7 +500,7 @@ def _zero(
 
 
 def _rates(t_s: tuple[np.ndarray, np.ndarray], goal: np.ndarray, position: np.ndarray) -> list[Check]:
-    """Return a finding if one side is sampled too slowly for the motion of the other."""
+    """Return a finding if goals or positions are sampled too slowly for the motion of the other."""
     findings = []
     sides = ("goals", t_s[0], goal), ("positions", t_s[1], position)
     for (slow, t, own), (fast, other, values) in (sides, sides[::-1]):
@@ -522,18 +523,18 @@ def _rates(t_s: tuple[np.ndarray, np.ndarray], goal: np.ndarray, position: np.nd
 
 
 def _rate(t_s: np.ndarray, values: np.ndarray) -> float:
-    """Return samples a second; of values that are repeated at equal times, as a table joins them, the new ones."""
+    """Return the samples per second [Hz]; values that a table repeats at equal intervals count once."""
     new = np.flatnonzero((np.diff(values, axis=0) != 0).any(axis=1)) + 1
     steps = np.diff(t_s[new]) if len(new) > 20 else np.diff(t_s)
     usual = float(np.median(steps))
     regular = len(new) > 20 and np.mean(np.abs(steps - usual) < 0.2 * usual) > 0.8
     steps = np.diff(t_s)
-    rest = steps[steps <= 10 * np.median(steps)]  # without pauses
+    rest = steps[steps <= 10 * np.median(steps)]  # ignore pauses
     return 1.0 / max(usual if regular else float(rest.mean()), 1e-9)
 
 
 def odd_columns(position: np.ndarray, names: Sequence[str]) -> list[Check]:
-    """Return a check on a column that is far larger than the others and turns back, as one in another unit does."""
+    """Return a check on a column that is far larger than the others and turns back, as if in another unit."""
     most = np.abs(position).max(axis=0)
     findings = []
     for i, size in enumerate(most):
@@ -546,7 +547,7 @@ def odd_columns(position: np.ndarray, names: Sequence[str]) -> list[Check]:
 
 
 def beyond(position: np.ndarray, names: Sequence[str], ranges: Mapping[str, tuple[float, float]]) -> list[Check]:
-    """Return a check on each joint that is outside of its range in the model for most of the time.
+    """Return a check for each joint that is outside of its range in the model for most of the time.
 
     Args:
         ranges: Joint -> lowest and highest position [rad or m].
@@ -568,7 +569,7 @@ def _on_grid(
     acting: np.ndarray | None,
     finer: int = 1,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return a grid with some rows a sample, held commands, interpolated positions, and whether commands act."""
+    """Return a time grid, ``finer`` than the samples; held commands; interpolated positions; whether commands act."""
     begin, end = max(t[0] for t in t_s), min(t[-1] for t in t_s)
     if not end > begin:
         none = np.zeros(0)
@@ -578,17 +579,17 @@ def _on_grid(
     newest = np.clip(np.searchsorted(t_s[0], grid + 1e-6, side="right") - 1, 0, None)
     joined = np.stack([np.interp(grid, t_s[1], column) for column in position.T], axis=1)
     live = np.ones(len(grid), bool) if acting is None else np.asarray(acting, bool)[newest]
-    # Between samples of a gap the motion is unknown.
+    # In a gap between samples the motion is unknown.
     after = np.searchsorted(t_s[1], grid).clip(1, len(t_s[1]) - 1)
     live &= (t_s[1][after] - t_s[1][after - 1]) < max(0.5, 10 * period_s)
     return grid, command[newest], joined, live
 
 
-# -- single columns
+# -- checks of single columns
 
 
 def is_rate(t_s: np.ndarray, angle: np.ndarray, velocity: np.ndarray) -> bool:
-    """Return whether velocities ``(N, joints)`` are the rate of angles, in the same unit."""
+    """Return whether velocities ``(N, joints)`` are the derivative of angles, in the same unit."""
     rows = np.isfinite(angle).all(axis=1) & np.isfinite(velocity).all(axis=1) & np.isfinite(t_s)
     if rows.sum() < 50 or (np.diff(t_s[rows]) <= 0).any():
         return False
@@ -600,9 +601,9 @@ def is_rate(t_s: np.ndarray, angle: np.ndarray, velocity: np.ndarray) -> bool:
 
 
 def unsigned(values: np.ndarray) -> int | None:
-    """Return the modulus (2^16, 2^32) or sign bit (2^15, 2^31) by which whole numbers jump; None if they do not.
+    """Return the modulus (2^16, 2^32) or sign bit (2^15, 2^31) by which whole numbers jump; None without jumps.
 
-    Signed counts that are read as unsigned jump from 0 to the modulus, or, with a sign bit, by the bit.
+    Signed counts that are read as unsigned jump from 0 to the modulus; with a sign bit, they jump by the bit's value.
 
     Args:
         values: Shape ``(N,)``, as in the file.
@@ -619,7 +620,7 @@ def unsigned(values: np.ndarray) -> int | None:
 
 
 def is_copy(t_s: tuple[np.ndarray, np.ndarray], goal: np.ndarray, position: np.ndarray, lag_s: float) -> bool:
-    """Return whether goals ``(N,)`` are copies of positions ``(M,)`` that are one lag older, or younger."""
+    """Return whether goals ``(N,)`` equal the positions ``(M,)`` that were measured ``lag_s`` earlier or later."""
     period_s = max(float(np.median(np.diff(t_s[0]))), 1e-6)
     newest = np.searchsorted(t_s[0], t_s[1] + 1e-6, side="right") - 1
     # Compare only rows in motion: resting columns are equal at every lag.
@@ -637,7 +638,7 @@ def is_copy(t_s: tuple[np.ndarray, np.ndarray], goal: np.ndarray, position: np.n
 
 
 def _step(values: np.ndarray) -> float:
-    """Return the step of rounded values if it is small relative to their motion; else 0."""
+    """Return the resolution of rounded values, if it is small relative to their motion; else 0."""
     levels = np.unique(np.round(values, 9))
     if not 40 <= levels.size < 0.5 * values.size:
         return 0.0
@@ -650,7 +651,7 @@ def counted(values: np.ndarray, turn: float) -> np.ndarray:
 
     Args:
         values: Shape ``(N, columns)``; rows without a number stay so.
-        turn: A turn, in the unit of the values.
+        turn: Size of a turn, in the unit of the values.
     """
     result = np.array(values, np.float64)
     for column in result.T:
@@ -659,7 +660,7 @@ def counted(values: np.ndarray, turn: float) -> np.ndarray:
         if angles.size < 3 or np.ptp(np.clip(angles, *np.quantile(angles, (0.02, 0.98)))) > 1.02 * turn:
             continue
         steps = np.diff(angles)
-        # At the end of a turn, a step differs from a turn by the motion; the other steps give its size.
+        # At the end of a turn, a step is a turn plus the motion, whose size the other steps show.
         motion = np.abs(steps[np.abs(steps) < 0.5 * turn])
         play = min(0.2, 0.02 + 2.0 * float(np.quantile(motion, 0.99)) / turn) * turn if motion.size else 0.0
         if (np.abs(np.abs(steps) - turn) < play).any():
@@ -670,7 +671,7 @@ def counted(values: np.ndarray, turn: float) -> np.ndarray:
 def glitches(t_s: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """Return whether a reading leaps away from its neighbours and back, ``(N, columns)``.
 
-    A joint cannot move farther than its highest speed allows, which is measured on the readings without leaps.
+    A leap is faster than the joint's highest speed, which is measured on the readings without leaps.
 
     Args:
         t_s: Shape ``(N,)``, increasing [s].
@@ -689,11 +690,11 @@ def glitches(t_s: np.ndarray, angle: np.ndarray) -> np.ndarray:
         far = off > reach_rad(fastest, period_s) + 12.0 * float(np.median(off))
         edges = np.flatnonzero(np.diff(far, prepend=False, append=False)).reshape(-1, 2)
         for begin, end in edges:
-            # A fast motion has several steps, a leap has one.
+            # A fast motion has several large steps in a row, a leap has one.
             ways = leap[max(begin - 1, 0) : begin], leap[end - 1 : end]
             if max(float(way.max(initial=0.0)) for way in ways) < 0.5 * off[begin:end].max():
                 far[begin:end] = False
-        found[:, i] = far if far.mean() <= 0.02 else False  # more of them are no glitches
+        found[:, i] = far if far.mean() <= 0.02 else False  # more leaps are no glitches
     return found
 
 

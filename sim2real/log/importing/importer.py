@@ -21,12 +21,12 @@ from sim2real.log.writer import SessionFile
 from sim2real.types import Json
 
 _MAX_TICKS = 2**53  # 285 years [us]: whole numbers up to here are exact in float64
-# Stamps from here on [us since 1970: September 2001] come from a wall clock; clocks that start at boot are far lower.
+# Stamps above this [us since 1970: September 2001] come from a wall clock; clocks that start at boot are far lower.
 _WALL_CLOCK = 10**15
-# With a first stamp up to here [us], stamps count from the recording's start; otherwise time 0 is the first sample.
+# If the first stamp is below this [us], stamps count from the recording's start; otherwise time 0 is the first sample.
 _OWN_START = 1_000_000
 _MOST_LACKING = 0.05
-"""A field of a node may lack numbers in this share of the samples in which the node's first field has one."""
+"""Largest share of a node's samples in which a field may lack a number."""
 _MOST_REPEATED = 0.1
 
 
@@ -36,12 +36,12 @@ def import_file(
     """Read a file of another recorder as an episode.
 
     Each sample becomes a step that starts and ends at the sample's time stamp. Recorded stamps are rounded to
-    microseconds. If the first one is within 1 s after 0, time 0 is that of the file; otherwise time 0 is the first
-    sample. Without recorded stamps, they are generated from the node's rate; stamps of a LeRobot data set that are
-    ``frame_index / fps`` count as generated. Turns of angles that jump at the end of a turn are counted. Samples that
-    lack a number, repeat the stamp before, or leap away and back are left out. The episode's metadata has ``stamps``
-    (node -> ``recorded`` or ``generated``), ``pipeline``, ``source`` (with the counts of what was left out), ``graph``,
-    ``mapping`` and ``versions``.
+    microseconds. If the first stamp is at most 1 s, time 0 is the file's; otherwise time 0 is the first sample. Without
+    recorded stamps, they are generated from the node's rate; the stamps ``frame_index / fps`` of a LeRobot data set
+    count as generated. Angles that jump at the end of a turn are unwrapped. Samples that lack a number, repeat the
+    previous stamp, or leap away and back are left out. The episode's metadata has ``stamps`` (node -> ``recorded`` or
+    ``generated``), ``pipeline``, ``source`` (with the number of left out samples), ``graph``, ``mapping`` and
+    ``versions``.
 
     Args:
         mapping: The mapping from signals to fields, or the mapping file.
@@ -105,8 +105,8 @@ def import_table(table: Table, mapping: ImportMapping, samples: slice | None = N
 def write_log(path: str | Path, episode: Episode) -> None:
     """Write an imported episode as a log.
 
-    Of steps with the same stamp, commands come last. The log's time 0 is 1970 on the wall clock unless the file's
-    stamps come from a wall clock.
+    At equal stamps, commands come last. The log's time 0 is 1970 on the wall clock, unless the file's stamps come from
+    a wall clock.
 
     Args:
         path: The log; it must not exist.
@@ -130,10 +130,10 @@ def write_log(path: str | Path, episode: Episode) -> None:
             name, k, tick = names[node[row]], int(seq[row]), int(ticks[row])
             record = StepRecord(name, k, tick, tick, tick, -1, tick, 0)
             file.step(record, [values[k] for values in episode.outputs[name].values()])
-        # Nothing else was measured: the end has no timing, no lateness and no suspicion.
+        # No lateness and no computation times were measured, so the session's end has none.
         file.finish({"status": "finished", "exit_code": OK})
     except BaseException:
-        # Remove an incomplete log, as the import can be repeated.
+        # Remove an incomplete log: the import can be repeated.
         file.abandon()
         Path(path).unlink(missing_ok=True)
         raise
@@ -162,9 +162,9 @@ class _Node:
 
     Attributes:
         fields: Field -> values of all samples in the log's unit, shape ``(N, ...)``.
-        stamps: Shape ``(N,)``, as recorded; None without any.
-        rows: The numbers of the selected samples in the file.
-        turning: Fields with angles that jumped at the end of a turn.
+        stamps: Shape ``(N,)``: recorded stamps; None without stamps.
+        rows: Numbers of the selected samples in the file.
+        turning: Fields with angles that jump at the end of a turn.
         dropped: Reason -> number of samples that were left out.
     """
 
@@ -176,7 +176,7 @@ class _Node:
                 f"stamps {mapping.stamps!r} in {table.path} have the shape {self.stamps.shape}, expected (N,)",
                 hint=f'choose a column, such as stamps = "{mapping.stamps}[:,0]"',
             )
-        # All signals have one length; constants are the same in every sample.
+        # All signals must have the same length; constants are repeated in every sample.
         signals = {source: table.signal(source) for how in mapping.fields.values() for source in how.sources}
         lengths = {source: len(values) for source, values in signals.items() if values.ndim}
         lengths |= {f"stamps {mapping.stamps!r}": len(self.stamps)} if self.stamps is not None else {}
@@ -196,7 +196,8 @@ class _Node:
         self.fields = {
             field: self.scaled(field, [series[s] for s in how.sources]) for field, how in mapping.fields.items()
         }
-        # A robot with hinges and slides has no unit. Count over all samples, so that a part has the turns of the whole.
+        # Fields of a robot with hinges and slides have no unit. Unwrap all samples, so that a part keeps the turns of
+        # the whole.
         self.turning: set[str] = set()
         for field, values in self.fields.items():
             how = mapping.fields[field]
@@ -207,11 +208,11 @@ class _Node:
                     self.turning.add(field)
 
     def scaled(self, field: str, parts: Sequence[np.ndarray]) -> np.ndarray:
-        """Return a field's values in the log's unit, shape ``(N, ...)``; a list of sources has the columns of all."""
+        """Return a field's values in the log's unit, shape ``(N, ...)``; columns of several sources are joined."""
         how = self.mapping.fields[field]
         factor, unit = in_si(how.unit)
         for source, part in zip(how.sources, parts, strict=True):
-            # Jumps by 2^16 or 2^32 are counts that were read with the wrong sign, unless they are a turn.
+            # Jumps by 2^16 or 2^32 come from counts that were read with the wrong sign, unless they are a turn.
             for column in part.reshape(len(part), -1).T if unit == "rad" else ():
                 modulus = checks.unsigned(column)
                 turns = factor * np.abs(np.asarray(how.scale)) * (modulus or 0) / checks.TURN_RAD
@@ -236,7 +237,7 @@ class _Node:
         return (values if factor == 1.0 else factor * values).astype(raw.dtype if raw.dtype.kind == "f" else np.float64)
 
     def keep(self, good: np.ndarray, reason: str) -> None:
-        """Leave out the selected samples that are not good."""
+        """Keep the good ones of the selected samples, and count the others under ``reason``."""
         self.dropped[reason] += int((~good).sum())
         self.rows = self.rows[good]
 
@@ -247,7 +248,7 @@ class _Node:
             for field, values in self.fields.items()
         }
         good = np.logical_and.reduce(list(whole.values()))
-        # Two streams in one table lack numbers in turn. A gain that is written rarely would cost most of the goals.
+        # In a table of two streams, numbers are missing in turn. A rarely written gain would make most goals drop out.
         first = next(iter(whole.values()))
         if (first & ~good).sum() > _MOST_LACKING * max(first.sum(), 1):
             field = min(whole, key=lambda name: whole[name].sum())
@@ -262,7 +263,7 @@ class _Node:
         if self.stamps is not None and len(self.rows):
             stamps = self.stamps[self.rows]
             fresh = np.concatenate([[True], stamps[1:] != stamps[:-1]])
-            if fresh.mean() > 1 - _MOST_REPEATED:  # more of them are stamps that are too coarse
+            if fresh.mean() > 1 - _MOST_REPEATED:  # more equal stamps mean that the stamps are too coarse
                 self.keep(fresh, "repeated stamp")
         for field, how in self.mapping.fields.items():
             if _is_position(field) and how.log_unit == "rad":
@@ -274,10 +275,10 @@ class _Node:
         if self.stamps is not None:
             t_s = self.stamps[self.rows] * (STAMP_UNITS[self.mapping.stamp_unit] * 1e-9)
         if len(self.rows) < 3 or not (np.isfinite(t_s).all() and (np.diff(t_s) > 0).all()):
-            return  # the check of stamps raises the better error
+            return  # the check of stamps raises a better error
         angle = self.fields[field][self.rows].reshape(len(self.rows), -1).astype(np.float64)
         good = np.asarray(~checks.glitches(t_s, angle).any(axis=1))
-        # It means another zero, another unit or missing samples.
+        # Such a jump means another zero, another unit or missing samples.
         if (jump := checks.leap(t_s[good], angle[good])) is not None:
             k, i, size = jump
             sources = self.mapping.fields[field].sources
@@ -334,7 +335,7 @@ def _cut(table: Table, nodes: Mapping[str, _Node], samples: slice) -> int:
             f"a range of samples is no range of time: it has a step, or nodes differ in their samples: {listed}",
             hint="import all samples, and cut the file itself",
         )
-    # Check the limits, as a slice would accept any number.
+    # Check the limits, because a slice would accept any number.
     count = next(iter(counts.values()))
     first, stop, _ = samples.indices(count)
     beyond = [n for n in (samples.start, samples.stop) if n is not None and not -count <= n <= count]
@@ -349,7 +350,7 @@ def _cut(table: Table, nodes: Mapping[str, _Node], samples: slice) -> int:
 def _align_turns(
     nodes: Mapping[str, _Node], outputs: Mapping[str, dict[str, np.ndarray]], ticks: Mapping[str, np.ndarray]
 ) -> None:
-    """Shift commands to the turn of their positions, as turns are counted from the start of each signal."""
+    """Shift commands by whole turns to their positions, because turns are counted from the start of each signal."""
     # Fields without a unit are those of a robot with hinges and slides.
     angles = [
         (n, f) for n, node in nodes.items() for f, how in node.mapping.fields.items() if how.log_unit in ("rad", "")

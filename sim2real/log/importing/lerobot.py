@@ -19,7 +19,8 @@ _COUNTERS = ("frame_index", "episode_index", "index", "task_index")
 _COUNTS = 4096
 _WHOLE = "download the data set again, or check the file"
 UNITS = ("deg", "hundredths")
-"""What LeRobot writes: degrees, or hundredths of each joint's calibrated range, -100 to 100, a gripper 0 to 100."""
+"""LeRobot's units: degrees, or hundredths of a joint's calibrated range from -100 to 100, for a gripper from 0 to 100.
+"""
 
 
 def read_lerobot(path: Path, episode: int | None = None) -> list[Table]:
@@ -30,7 +31,7 @@ def read_lerobot(path: Path, episode: int | None = None) -> list[Table]:
         episode: Number of the episode; None: all.
 
     Raises:
-        UsageError: When the files are no Parquet, or lack the episode.
+        UsageError: The files are no Parquet, or lack the episode.
     """
     try:
         import pyarrow
@@ -71,7 +72,7 @@ def _table(
         if name not in _COUNTERS or not is_set:
             table.add(name, values)
     table.names = {name: listed for name, listed in _names(info).items() if name in table.columns}
-    # Stamps that are frame_index / fps are no measurement.
+    # Stamps equal to frame_index / fps were not measured.
     fps, stamps = info.get("fps"), table.columns.get("timestamp")
     if fps:
         table.columns["fps"] = np.asarray(fps, np.float64)
@@ -136,13 +137,13 @@ def _names(info: Mapping[str, Any]) -> dict[str, list[str]]:
 
 
 def writes_hundredths(robot: str, names: Sequence[str]) -> bool:
-    """Return whether LeRobot's unit of a robot's joints may be hundredths of a range: of its own arms, ``NAME.pos``."""
+    """Return whether positions may be in hundredths of a range: on LeRobot's own arms, named ``NAME.pos``."""
     own = ("so100", "so101", "so_", "bi_so", "koch", "bi_koch", "lekiwi", "moss", "omx", "hope_jr")
     return bool(robot) and (robot.startswith(own) or any(name.endswith(".pos") for name in names))
 
 
 def is_gripper(name: str) -> bool:
-    """Return whether a joint is a gripper, which LeRobot writes as 0 to 100 also beside an arm in degrees."""
+    """Return whether a joint is a gripper, which LeRobot writes as 0 to 100, even if the arm is in degrees."""
     return any(word in name.lower() for word in ("gripper", "jaw"))
 
 
@@ -150,12 +151,12 @@ def conversion(calibration: Path, joints: Sequence[str], unit: str) -> tuple[lis
     """Return scale and offset of each joint [rad]: 0 is the middle of the calibrated range.
 
     Args:
-        calibration: LeRobot's file, as ``lerobot-calibrate`` writes it.
+        calibration: LeRobot's file, written by ``lerobot-calibrate``.
         joints: Names of the joints, as in the file.
         unit: ``deg`` or ``hundredths``; a gripper is in hundredths from 0 to 100 with both.
 
     Raises:
-        UsageError: When the file is no calibration, or lacks a joint.
+        UsageError: The file is no calibration, or lacks a joint.
     """
     try:
         entries = json.loads(calibration.read_bytes())
@@ -171,7 +172,8 @@ def conversion(calibration: Path, joints: Sequence[str], unit: str) -> tuple[lis
         joint = next((n for n in ranges if label == n or label.endswith(f"_{n}")), label)  # main_elbow_flex in v2
         if joint not in ranges:
             raise UsageError(
-                f"{calibration} has no {joint!r}. Available: {', '.join(ranges)}", hint="name its own file"
+                f"{calibration} has no {joint!r}. Available: {', '.join(ranges)}",
+                hint="give the calibration of this arm",
             )
         low, high, mirrored = ranges[joint]
         half = (high - low) / 2 * 2 * math.pi / _COUNTS
@@ -179,7 +181,7 @@ def conversion(calibration: Path, joints: Sequence[str], unit: str) -> tuple[lis
             scales.append(half / 50)
             offsets.append(-half)
         elif unit == "hundredths":
-            scales.append(half / 100)  # LeRobot mirrors hundredths itself
+            scales.append(half / 100)  # LeRobot itself mirrors hundredths
             offsets.append(0.0)
         else:
             scales.append((-1 if mirrored else 1) * (_COUNTS - 1) / 360 * 2 * math.pi / _COUNTS)
@@ -188,7 +190,7 @@ def conversion(calibration: Path, joints: Sequence[str], unit: str) -> tuple[lis
 
 
 def unit_of(calibration: Path, joints: Sequence[str], values: np.ndarray) -> str | None:
-    """Return the unit in which positions ``(N, joints)`` are whole counts by a calibration; None if unclear."""
+    """Return the unit in which positions ``(N, joints)`` are whole encoder counts; None if unclear."""
     arm = [i for i, joint in enumerate(joints) if not is_gripper(joint)]
     fits = []
     for unit in UNITS:

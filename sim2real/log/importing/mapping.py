@@ -1,4 +1,4 @@
-"""The mapping of another recorder's file to a log: the source of each field. Its file is ``import.toml``."""
+"""The mapping of another recorder's file to a log, which has the source of each field; stored as ``import.toml``."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from sim2real.types import Json
 STAMP_UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 """Unit of time stamps -> nanoseconds."""
 MAPPING = "import.toml"
-"""The mapping file in a pipeline's folder."""
+"""Name of the mapping file in a pipeline's folder."""
 Key = tuple[str, str, str]
-"""Node, field or empty, and key of a line of a mapping file."""
+"""A line of a mapping file: node, field (or empty), and key."""
 _SI = {
     "deg": (math.pi / 180, "rad"),
     "rev": (2 * math.pi, "rad"),
@@ -36,9 +36,9 @@ _HINT = "the guide 'Import' has a mapping file with every key"
 
 
 def in_si(unit: str) -> tuple[float, str]:
-    """Return factor and SI unit of a unit in a file: degrees, turns, mrad and mm, ``counts:N``, each also per second.
+    """Return the factor to SI units, and the SI unit, of degrees, turns, mrad, mm and ``counts:N``, also per second.
 
-    ``counts:4096`` are steps of an encoder with 4096 counts a turn. Other units stay as they are.
+    ``counts:4096`` are counts of an encoder with 4096 counts per turn. Other units stay as they are.
     """
     base, per, time = unit.partition("/")
     factor, si = _SI.get(base, (1.0, base))
@@ -48,15 +48,15 @@ def in_si(unit: str) -> tuple[float, str]:
 
 
 class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """A table of a mapping file; a key that it does not know is an error."""
+    """A table of a mapping file; unknown keys are errors."""
 
 
 class FieldMapping(_Table, frozen=True):
     """The source of a field of a node's output.
 
     Attributes:
-        source: Name of a signal in the file, or a list of names, also of one, whose columns make a vector; ``q[:,0]``
-            is a column of an array.
+        source: Name of a signal in the file, or a list of names, whose columns are joined to a vector; ``q[:,0]`` is a
+            column of an array.
         unit: Unit of the field after scaling; degrees, turns and counts are converted to radians, mm to m.
         scale: The field is ``scale * signal + offset``; one number, or one for each column.
         offset: See ``scale`` [the field's unit]; one number, or one for each column.
@@ -97,7 +97,7 @@ class NodeMapping(_Table, frozen=True):
         rate_hz: Rate of generated time stamps [Hz]; None: use ``stamps``.
         stamps: Signal with the recorded time stamps; None: use ``rate_hz``.
         stamp_unit: Unit of the recorded stamps.
-        stamp_offset: Added to the recorded stamps, for a stream with its own clock [s].
+        stamp_offset: Time that is added to the recorded stamps, if a stream has its own clock [s].
     """
 
     fields: Mapping[str, FieldMapping]
@@ -143,7 +143,7 @@ class ImportMapping(_Table, frozen=True):
             pipeline: Pipeline of the log; default: the document's.
 
         Raises:
-            UsageError: When a key is unknown, missing or of the wrong type.
+            UsageError: A key is unknown or missing, or its value has the wrong type.
         """
         where = "the mapping" if path is None else str(path)
         document = _convert(tables, _Document, where)
@@ -154,7 +154,7 @@ class ImportMapping(_Table, frozen=True):
             raise UsageError(f"{where} is for pipeline {name!r}, not for {pipeline!r}", hint="--mapping FILE names it")
         if not document.nodes:
             raise UsageError(f"{where} has no nodes", hint="add a table [nodes.NAME] for each node; " + _HINT)
-        # Convert table by table, so that an error names the node and the field.
+        # Convert table by table, so that an error can name node and field.
         nodes = {}
         for node, table in document.nodes.items():
             at, fields = f"{where}: nodes.{node}", table.get("fields")
@@ -176,7 +176,7 @@ def load_mapping(path: str | Path, pipeline: str | None = None) -> ImportMapping
         pipeline: Pipeline of the log; default: the file's.
 
     Raises:
-        UsageError: When the file does not exist, is not TOML, is no valid mapping, or has an open question.
+        UsageError: The file does not exist, is no TOML or no valid mapping, or has an open question.
     """
     path = Path(path)
     try:
@@ -192,7 +192,7 @@ def load_mapping(path: str | Path, pipeline: str | None = None) -> ImportMapping
         line = text.count("\n", 0, question.start()) + 1
         raise UsageError(
             f"{path} has an open question in line {line}: {question[0].lstrip('# ')}",
-            hint=f"put the answer in place of the line, such as {question[1]} = ...",
+            hint=f"replace the line by the answer, such as {question[1]} = ...",
         )
     return ImportMapping.from_dict(tables, pipeline, path)
 
@@ -219,8 +219,8 @@ def to_toml(
 
     Args:
         comments: Lines at the beginning.
-        reasons: Evidence for the lines of keys.
-        questions: Questions that stand in place of the lines of keys.
+        reasons: Line -> evidence, which becomes a comment.
+        questions: Line -> question, which replaces the line.
     """
     reasons, questions = reasons or {}, questions or {}
     lines = [f"# {part}" for line in comments for part in _printable(line) or [""]]
@@ -245,10 +245,10 @@ def to_toml(
 
 
 def toml_value(value: object) -> str:
-    """Return a text, a number, a boolean or a list of them as TOML writes it.
+    """Return a text, a number, a boolean or a list of them in TOML.
 
     Raises:
-        UsageError: When it is of another type, or a text has half a character, which names of files can have.
+        UsageError: The value has another type, or a text is not valid Unicode, as names of files may be.
     """
     match value:
         case str():
@@ -258,7 +258,7 @@ def toml_value(value: object) -> str:
                 raise UsageError(
                     f"{value!r} cannot be written: it has bytes that are no text", hint="rename the file or joint"
                 ) from None
-            # TOML has the escapes of JSON, and needs one for DEL.
+            # TOML has the escapes of JSON, and also escapes DEL.
             return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
         case bool():
             return str(value).lower()
@@ -270,7 +270,7 @@ def toml_value(value: object) -> str:
 
 
 def toml_key(key: str) -> str:
-    """Return a part of a key, quoted if TOML needs quotes."""
+    """Return a part of a key, quoted if TOML requires it."""
     return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else toml_value(key)
 
 

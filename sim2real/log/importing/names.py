@@ -1,4 +1,4 @@
-"""The meaning of names in a file of another recorder: side, quantity, unit and joint; which columns belong together."""
+"""Reads names in a recorder's file: command or measurement, quantity, unit and joint; and joins columns to signals."""
 
 from __future__ import annotations
 
@@ -64,25 +64,25 @@ _PHRASES = (
     (r"(?i)\binput_(?=pos|vel)", "command_"),  # ODrive
     (r"\b(d?q)_d_(?=[A-Za-z0-9])", r"\1_command_"),  # libfranka; q_d alone may be a joint d
 )
-"""Spellings of some makers -> words of the tables."""
+"""Spellings of some manufacturers -> words of the tables."""
 _WEAK_WORDS = {"state", "states"}
 _SIDE, _QUANTITY, _UNIT = (
     {word: kind for kind, words in table.items() for word in words.split()} for table in (_SIDES, _QUANTITIES, _UNITS)
 )
 _MEANINGLESS = "data entries msg log values value points motor motors servo servos axis per joint joints header field"
 _FILLERS = set(_MEANINGLESS.split())
-"""Parts of messages, and names of lists of records."""
+"""Parts of names that have no meaning, such as names of messages."""
 _WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
 
 
 @dataclass(frozen=True)
 class Meaning:
-    """The meaning of a name; a part is empty if the name lacks it."""
+    """The meaning of a name; empty strings for missing parts."""
 
     side: str = ""  # command or measured
     quantity: str = ""  # a key of the table of quantities
     unit: str = ""  # a key of the table of units
-    label: str = ""  # the remaining words, which name the joint
+    label: str = ""  # the remaining words, which are the joint's name
 
 
 def meaning(name: str) -> Meaning:
@@ -98,9 +98,9 @@ def meaning(name: str) -> Meaning:
         if word in _SIDE:
             continue
         if word in _QUANTITY and not (quantity == "stamp" and known_unit):
-            # The last quantity counts, unless it is an error: `torque_enable` enables, `goal_time` is a time.
+            # The last quantity counts, unless it is an error: `torque_enable` is an enabling, `goal_time` a time.
             quantity = quantity if quantity == "error" else _QUANTITY[word]
-        elif word == "reach" and quantity == "payload":  # alone it may be of a task
+        elif word == "reach" and quantity == "payload":  # alone, the word may belong to a task
             quantity = "reach"
         elif known_unit:
             unit = known_unit
@@ -108,7 +108,7 @@ def meaning(name: str) -> Meaning:
             rest.append(word)
     if len(words) == 1 and len(words[0]) > 1 and _UNIT.get(words[0]) in ("s", "ms", "us", "ns"):  # such as `millis`
         quantity, unit, rest = "stamp", _UNIT[words[0]], []
-    # `dq_rad_s`: an angle over a time is a velocity, in the angle's unit.
+    # `dq_rad_s`: an angle over a time is the unit of a velocity, whose angle counts.
     if quantity == "velocity" and unit == "s":
         unit = next((u for w in words if (u := _UNIT.get(w, "")) in LENGTHS_AND_ANGLES), "")
     side = _side(name)
@@ -120,7 +120,7 @@ def meaning(name: str) -> Meaning:
 
 def is_unit(cell: str) -> bool:
     """Return whether a cell of a table holds a unit, such as ``[rad]``, or nothing."""
-    others = {"v", "a", "n", "nm"}  # of quantities that are no angles
+    others = {"v", "a", "n", "nm"}  # units of quantities that are no angles
     return bool(re.fullmatch(r"\[.*\]|\(.*\)", cell.strip())) or all(w in _UNIT or w in others for w in _words(cell))
 
 
@@ -129,7 +129,7 @@ def _words(name: str) -> list[str]:
 
 
 def _side(name: str) -> str:
-    """Return the side of a signal, from the innermost part of its path with a side.
+    """Return whether a signal is a command or measured, by the innermost part of its path that says so.
 
     ``/controller_state.reference.positions`` is a command, although its topic is a state.
     """
@@ -143,7 +143,7 @@ def _side(name: str) -> str:
 
 
 def about_torque(mapping: Mapping[str, Mapping[str, Json]]) -> list[str]:
-    """Return a sentence if a log's commanded torque has a name that does not mark a command.
+    """Return a sentence if the name of a log's commanded torque does not say that it is a command.
 
     Args:
         mapping: Node -> its mapping, as in the metadata of an imported log.
@@ -164,13 +164,13 @@ def about_torque(mapping: Mapping[str, Mapping[str, Json]]) -> list[str]:
 
 
 def are_numbers(labels: Sequence[str]) -> bool:
-    """Return whether labels are the numbers of joints, not their names: ``3``, or ``m_3``, with one letter for all."""
+    """Return whether labels are numbers of joints, not names: ``3``, or ``m_3`` with the same letter for all."""
     found = [re.fullmatch(r"([a-z]?)_?\d+", meaning(label).label) for label in labels]
     return None not in found and len({match[1] for match in found if match}) == 1
 
 
 def numbers_of(names: Sequence[str]) -> list[int]:
-    """Return the numbers by which alone names differ, as ``A1`` and ``A2`` do; nothing if they differ otherwise."""
+    """Return the numbers in names that differ only in a number, such as ``A1`` and ``A2``; else nothing."""
     found = [re.fullmatch(r"(.*?)(\d+)", "_".join(w for w in _words(n) if w not in _FILLERS)) for n in names]
     numbers = [int(match[2]) for match in found if match]
     stems = {match[1] for match in found if match}
@@ -178,7 +178,7 @@ def numbers_of(names: Sequence[str]) -> list[int]:
 
 
 def same_joint(label: str, joint: str) -> bool:
-    """Return whether a column's label is the name of a model's joint, as ``fl_hip`` is of ``FL_hip_joint``."""
+    """Return whether a column's label means a joint of the model, as ``fl_hip`` means ``FL_hip_joint``."""
     return bool(_spellings(label) & _spellings(joint))
 
 
@@ -188,7 +188,7 @@ def _spellings(joint: str) -> set[str]:
 
 
 def columns_of(joints: Sequence[str], labels: Sequence[str]) -> tuple[list[int], str] | None:
-    """Return the column of each joint of a robot by the labels of columns, and how they match; None if they do not.
+    """Return the column of each joint of a robot, by labels, and how they match; None if they do not match.
 
     Names match as they are, or without the prefix that all of one side have, by number, if only numbers tell them
     apart, or by leg and part: a vendor's ``FR_0`` is the first joint of the front right leg, ``LF_HAA`` the hip of the
@@ -200,7 +200,7 @@ def columns_of(joints: Sequence[str], labels: Sequence[str]) -> tuple[list[int],
         if all(len(found) == 1 for found in exact):
             return [found[0] for found in exact], f"by name{how}"
     mine, given = numbers_of(joints), numbers_of(labels)
-    if mine and given:  # each may count from 0 or from 1
+    if mine and given:  # file and robot may count from 0 or from 1
         shifts = {0, min(mine) - min(given)} if {min(mine), min(given)} == {0, 1} else {0}
         found = next((s for s in shifts if {k - s for k in mine} <= set(given)), None)
         return None if found is None else ([given.index(k - found) for k in mine], "by number")
@@ -220,7 +220,7 @@ def _short(names: Sequence[str]) -> list[str]:
 
 
 def _legs(names: Sequence[str]) -> list[tuple[str, int]]:
-    """Return leg and number of the part, 0 for the hip, of each name; nothing if one has no leg or no part."""
+    """Return leg and number of the part (0: hip) of each name; nothing if a name has no leg or no part."""
     legs: list[str] = []
     parts: list[str] = []
     either = "|".join(_LEGS)
@@ -233,7 +233,7 @@ def _legs(names: Sequence[str]) -> list[tuple[str, int]]:
         parts.append(match[2] or match[3])
     if not any(part.isdigit() for part in parts):
         return [] if set(parts) - set(_PART) else [(leg, _PART[p]) for leg, p in zip(legs, parts, strict=True)]
-    # Numbers count from 0 or from 1, in each leg alike.
+    # Numbers count from 0 or from 1, equally in all legs.
     numbers = [int(part) if part.isdigit() else -1 for part in parts]
     if not 0 <= min(numbers) <= 1 or len(set(legs)) * len(set(numbers)) != len(names):
         return []
@@ -263,11 +263,11 @@ class Signal:
 
     Attributes:
         sources: Source of each column, as in a mapping.
-        labels: Joint of each column; empty if its name has none.
+        labels: Joint of each column; empty if the column's name has no joint.
         values: Shape ``(N, columns)``; ``(columns,)`` for constants.
         whole: Source of all columns together; empty if they are separate signals of the file.
-        scale: What makes each column SI, if their names have several units; else empty.
-        stream: The topic in a bag, or the file of one of several; empty for others.
+        scale: Factor of each column to SI units, if their names have several units; else empty.
+        stream: Topic of a bag, or one of several files; otherwise empty.
     """
 
     sources: tuple[str, ...]
@@ -287,7 +287,7 @@ class Signal:
         return len(self.sources)
 
     def taken(self, places: Sequence[int]) -> Signal:
-        """Return some of the columns, in this order."""
+        """Return the columns at ``places``, in this order."""
         whole = self.whole if list(places) == list(range(self.width)) else ""
         sources, labels = (tuple(part[i] for i in places) for part in (self.sources, self.labels))
         scale = tuple(self.scale[i] for i in places) if self.scale else ()
@@ -295,22 +295,22 @@ class Signal:
         return replace(self, sources=sources, labels=labels, values=values, whole=whole, scale=scale)
 
     def mapped(self, unit: str) -> FieldMapping:
-        """Return the field that has these columns."""
+        """Return the mapping's field with these columns."""
         return FieldMapping(self.whole or self.sources, unit, **({"scale": self.scale} if self.scale else {}))
 
 
 def collect(table: Table) -> tuple[list[Signal], list[str]]:
-    """Return all signals of numbers with at most two dimensions, and notes on skipped ones.
+    """Return all signals of numbers with at most two dimensions, and notes on skipped signals.
 
     Columns whose names differ only by the joint are one signal.
 
     Raises:
-        UsageError: When a signal with the name of a position or a command cannot be read.
+        UsageError: A signal with the name of a position or a command cannot be read.
     """
     notes: list[str] = []
     for key, why in table.broken.items():
         named = _meaning(key, table)
-        # Without such a column, another one could be taken for the positions.
+        # Do not skip the column: another one could be taken for the positions.
         if named.quantity == "position" or (named.side and not named.quantity):
             raise UsageError(f"{key!r} in {table.path} cannot be read: {why}", hint="correct it, or remove the column")
         notes.append(f"skipped: {key!r}: {why}")
@@ -353,7 +353,7 @@ def collect(table: Table) -> tuple[list[Signal], list[str]]:
 
 
 def _by_unit(rows: list[Signal]) -> list[list[Signal]]:
-    """Return signals by their units; those of different joints, each with a unit of length or angle, stay together."""
+    """Group signals by unit; signals of different joints with units of length or angle stay together."""
     groups: dict[str, list[Signal]] = {}
     for row in rows:
         groups.setdefault(row.meaning.unit, []).append(row)
@@ -363,7 +363,7 @@ def _by_unit(rows: list[Signal]) -> list[list[Signal]]:
 
 
 def _meaning(key: str, table: Table) -> Meaning:
-    """Return the meaning of a signal's name; of a file's name only the side counts."""
+    """Return the meaning of a signal's name; in a file's name, only the word for command or measurement counts."""
     stem = next((stem for stem in table.stems if key.startswith(stem)), "")
     named = meaning(key[len(stem) :])
     return named if named.side or not stem else replace(named, side=meaning(stem).side)
@@ -376,7 +376,7 @@ def _stream(key: str, table: Table) -> str:
 
 
 def _label(key: str, named: Meaning, table: Table) -> str:
-    """Return a column's joint; ``position0`` is that of the name in ``name0``, as rostopic writes it."""
+    """Return a column's joint; in rostopic's files, ``position0`` belongs to the joint named in ``name0``."""
     if match := re.fullmatch(r"(.*?)[a-z]+(\d+)", key):
         words = table.words.get(f"{match[1]}name{match[2]}", [])
         if words and len(set(words)) == 1:
@@ -385,7 +385,7 @@ def _label(key: str, named: Meaning, table: Table) -> str:
 
 
 def _joint_of(name: str) -> str:
-    """Return a joint of a list of names: ``shoulder.pos`` is of ``shoulder``, others are kept as they are."""
+    """Return the joint in a name such as ``shoulder.pos``; other names stay as they are."""
     named = meaning(name)
     return named.label or name if named.side or named.quantity or named.unit else name
 
@@ -397,7 +397,7 @@ def _names_joints(key: str, words: Sequence[str]) -> bool:
 
 
 def _names_of(key: str, width: int, lists: Mapping[str, list[str]], table: Table) -> list[str]:
-    """Return the names of a signal's columns by the list in the file that shares most words with its name."""
+    """Return the names of a signal's columns, from the list whose name shares most words with the signal's."""
     words = set(re.findall("[a-z]+", key.lower()))
     shared = {k: len(set(re.findall("[a-z]+", k.lower())) & words) for k, names in lists.items() if len(names) == width}
     best = [lists[k] for k, n in shared.items() if n == max(shared.values())]

@@ -1,4 +1,4 @@
-"""Proposes the mapping of a file from its names; what they leave open becomes a question; data only check it."""
+"""Proposes the mapping of a file from its names. Open choices become questions; the data only check the mapping."""
 
 from __future__ import annotations
 
@@ -53,23 +53,23 @@ _EXTRA = {
     "payload": ("payload", None, "kg"),
     "payload_reach": ("reach", None, "m"),
 }
-"""Commands beside a goal: field -> quantity, side or None for any, and unit."""
+"""Further commands: field -> quantity, ``command``, ``measured`` or None for any, and unit."""
 _KNOWN_UNITS = (
     (r"joint_?(state|command)s?|field\.(position|header)", "messages of ROS are in radians"),
     (r"qpos|dof_?pos", "MuJoCo and Isaac are in radians"),
     (r"(actual|target)_q(?![a-z])", "RTDE of Universal Robots is in radians"),
     (r"motor_?(state|cmd)", "Unitree's messages are in radians"),
 )
-"""Names of whole families that are in radians, and the evidence."""
+"""Families of names that are in radians, and the evidence."""
 _OF_SLIDES = {"rad": "m", "rad/s": "m/s", "N m": "N"}
 _RATES_HZ = (5.0, 12_000.0)
 """Usual sampling rates of recorders."""
 _WALL_S = (1e9, 4e9)
-"""Wall clocks read this many seconds since 1970 (2001 to 2096)."""
+"""Range of a wall clock [s since 1970], 2001 to 2096."""
 _FLOATING = 7
-"""Columns of a floating base before those of the joints: its position, and its orientation as a quaternion."""
+"""Columns of a floating base that precede the joints: its position, and its orientation as a quaternion."""
 _APART_S = 0.02
-"""Two clocks of one topic that disagree by more are a question."""
+"""Largest disagreement of two clocks of one topic, above which the import asks [s]."""
 
 
 @dataclass(frozen=True)
@@ -80,10 +80,10 @@ class ImportHints:
         pipeline: Name of the log's pipeline.
         rate_hz: Rate of the samples if the file has no stamps [Hz].
         joints: Names of the robot's joints, in its order; empty if unknown.
-        as_told: Keep names, order, signs and units, even if they are ambiguous or contradict the data.
+        as_told: Keep names, order, signs and units as in the file, even if they are ambiguous or contradict the data.
         slides: Names of the sliding joints, whose positions are lengths.
         ranges: Joint -> lowest and highest position in the model [rad or m].
-        unit: Unit of positions and goals in the file; empty: by their names.
+        unit: Unit of positions and goals in the file; empty: from their names.
         calibration: LeRobot's calibration of the arm.
     """
 
@@ -98,10 +98,10 @@ class ImportHints:
 
 
 def propose(table: Table, hints: ImportHints) -> Proposal:
-    """Return the mapping that names and units give, checked against the data.
+    """Return the mapping that follows from names and units, checked against the data.
 
     Raises:
-        UsageError: When names do not match those of the robot, or the data contradict the names.
+        UsageError: The names are not those of the robot, or the data contradict the names.
     """
     proposal = Proposal(table, hints)
     proposal.complete()
@@ -109,14 +109,14 @@ def propose(table: Table, hints: ImportHints) -> Proposal:
 
 
 class Proposal:
-    """A mapping, with the evidence for each line, and what is open.
+    """A mapping, with the evidence for each line, and open questions.
 
     Attributes:
-        mapping: The mapping; where a question is open, it holds the likeliest answer.
-        joints: Names of the columns of measured positions, in the order of the log; numbers without names.
-        reasons: Evidence for a line of the mapping.
-        questions: What names and data do not decide: the line with its candidates.
-        evidence: Further sentences.
+        mapping: The mapping; for an open question, it has the likeliest answer.
+        joints: Names of the columns of measured positions, in the order of the log; numbers if there are no names.
+        reasons: Line of the mapping -> evidence.
+        questions: Line that names and data do not decide -> question with candidates.
+        evidence: Further evidence, as sentences.
     """
 
     def __init__(self, table: Table, hints: ImportHints) -> None:
@@ -144,20 +144,20 @@ class Proposal:
             for (node, name, key), text in self.questions.items()
         )
 
-    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # damaged files can hold numbers of any size
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # damaged files may have numbers of any size
     def complete(self) -> None:
         """Propose the mapping, and check it.
 
         Raises:
-            UsageError: As ``propose``; if the data contradict the mapping, it is complete.
+            UsageError: As ``propose``. If the data contradict the mapping, the mapping is complete nevertheless.
         """
-        # Which columns are the positions and the commands, and of which joints.
+        # Find the columns of positions and commands, and their joints.
         measured = self.choose("measured", self.signals)
         command = self.choose("command", [s for s in self.signals if s is not measured], measured)
         places, self.joints = self.joint_order(measured)
         measured = measured.taken(places)
         command, by_name = self.matched(command, measured, places)
-        # Their clocks and units. A unit of one side holds for the other, and the data must agree.
+        # Find clocks and units. A unit of positions also holds for goals, and the reverse; the data must agree.
         sides = {"actuator": command, "sensor": measured}
         clocks = {node: self.clock(signal, node) for node, signal in sides.items()}
         kind = command.meaning.quantity or "position"
@@ -176,14 +176,14 @@ class Proposal:
                 unproven = at
                 units[at] = next(iter(known)), "as of the other side: its own name has none"
             self.fields[at[0]][at[1]] = self.angle(at, signal, *units[at])
-        # What goes along.
+        # Add further fields.
         self.add_extras(command, measured, places)
         self.add_velocities(command, measured, places, {node: t_s for node, (_, t_s) in clocks.items()})
         nodes = {node: NodeMapping(self.in_lengths(self.fields[node]), **clocks[node][0]) for node in sides}
         self.mapping = ImportMapping(self.hints.pipeline, nodes)
         self.evidence += about_torque({n: msgspec.to_builtins(node) for n, node in nodes.items()})
         self.add_unused()
-        # What the data say.
+        # Check the mapping against the data.
         if not self.questions:
             try:
                 episode = import_table(self.table, self.mapping)
@@ -209,11 +209,11 @@ class Proposal:
     # -- positions, commands, and their joints
 
     def choose(self, side: str, signals: Sequence[Signal], other: Signal | None = None) -> Signal:
-        """Return the measured positions, or the commands, by their names; ask if names do not decide."""
+        """Return the signal of the measured positions, or of the commands; ask if names do not decide."""
         series = [s for s in signals if s.values.ndim == 2 and len(s.values) > 2]
         ranks = [(rank, s) for s in series if (rank := _rank(s.meaning, side)) is not None]
         best = [s for rank, s in ranks if rank == min(r for r, _ in ranks)]
-        # Of several, take those of the robot's joints, or as wide as the other side; equal ones are the same.
+        # Of several, take the one with the robot's joints, or with as many columns as ``other``; equal data count once.
         if len(best) > 1 and self.hints.joints:
             best = [s for s in best if columns_of(self.hints.joints, s.labels)] or best
         if len(best) > 1 and other is not None:
@@ -229,7 +229,7 @@ class Proposal:
         choices = unlike or [
             s for s in series if s.meaning.quantity in ("", "position") and s.meaning.side != other_side
         ]
-        if other is not None:  # the likeliest first
+        if other is not None:  # the likeliest candidate first
             choices.sort(key=lambda s: (set(s.labels) != set(other.labels), s.width != other.width))
         if not choices and (longest := max((len(s.values) for s in self.signals), default=0)) < 3:
             count = "1 sample" if longest == 1 else f"{longest} samples"
@@ -276,8 +276,8 @@ class Proposal:
                 f"the {measured.width} columns of {measured.name!r} in {self.table.path} "
                 f"({', '.join(label or 'no name' for label in labels)}) are not the robot's {len(joints)} joints: "
                 f"{', '.join(joints)}",
-                hint="name the recorded joints as the file does, or list the sources in a mapping in the robot's order"
-                + "; --as-told takes the file's order for the robot's" * (len(joints) == measured.width),
+                hint="name the recorded joints as the file does, or list the sources in the robot's order in a mapping"
+                + "; --as-told assumes that the file has the robot's order" * (len(joints) == measured.width),
             )
         if numbered and (numbers := numbers_of(labels)):
             measured = measured.taken(places := np.argsort(numbers).tolist())
@@ -306,9 +306,9 @@ class Proposal:
         named = all(measured.labels) and all(command.labels)
         if named and not (are_numbers(measured.labels) or are_numbers(command.labels)):
             raise UsageError(
-                f"the commands {command.name!r} in {self.table.path} are of {', '.join(command.labels)}, the positions "
-                f"{measured.name!r} of {', '.join(measured.labels)}",
-                hint="give the joints the same names on both sides, or write a mapping with the sources in one order",
+                f"the commands {command.name!r} in {self.table.path} belong to {', '.join(command.labels)}, the "
+                f"positions {measured.name!r} to {', '.join(measured.labels)}",
+                hint="name joints of commands and positions alike, or write a mapping with the sources in one order",
             )
         if command.width != measured.width:
             if command.width <= max(places, default=0) or any(command.labels):
@@ -331,7 +331,8 @@ class Proposal:
         fitting = [s for s in named if _increases(s.values[:, 0])]
         if self.hints.rate_hz is not None or not fitting:
             return self.generated_clock(named, count, node)
-        # Prefer the stamps of the signal's own topic or file, then those of its side; in a topic, the header's.
+        # Prefer the stamps of the signal's topic or file, there the header's; then stamps named like commands or
+        # measurements.
         side = of.meaning.side or ("command" if node == "actuator" else "measured")
         groups = (
             [s for s in fitting if of.stream and s.stream == of.stream],
@@ -364,7 +365,7 @@ class Proposal:
         return keys, values * STAMP_UNITS[unit or "s"] * 1e-9
 
     def generated_clock(self, named: Sequence[Signal], count: int, node: str) -> tuple[dict[str, Any], np.ndarray]:
-        """Return the keys and stamps of a node without a clock: by the flag, a rate in the file, or a question."""
+        """Return the keys and stamps of a node without a clock, by --rate-hz or a rate in the file, or ask."""
         rate_hz, reason = self.hints.rate_hz, "--rate-hz"
         for s in self.signals if rate_hz is None else ():
             if s.values.shape == (1,) and s.values[0] > 0 and s.meaning.quantity in ("rate", "period"):
@@ -396,7 +397,7 @@ class Proposal:
     # -- units
 
     def unit(self, signal: Signal) -> tuple[str, str]:
-        """Return a signal's unit by flag, name or kind of file, and the reason; or no unit, and candidates if known."""
+        """Return a signal's unit by flag, name or file format, and the reason; or no unit, and the known candidates."""
         names = tuple(self.table.names.get(signal.whole, ()))
         of_columns = {meaning(name).unit for name in names}
         named = signal.meaning.unit or (of_columns.pop() if len(of_columns) == 1 else "")
@@ -415,7 +416,7 @@ class Proposal:
             hers = self.table.robot or (self.hints.unit == "deg" and all(name.endswith(".pos") for name in names))
             if hers and not calibration and (jaws := list(filter(lerobot.is_gripper, signal.labels))):
                 raise UsageError(
-                    f"LeRobot writes {', '.join(jaws)} as 0 to 100 of its range, which is in no unit of angle",
+                    f"LeRobot writes {', '.join(jaws)} as 0 to 100 % of its range, which is no angle",
                     hint="--calibration FILE.json converts it",
                 )
             return self.hints.unit, "--unit"
@@ -438,7 +439,7 @@ class Proposal:
         return "", ""
 
     def angle(self, at: tuple[str, str], signal: Signal, unit: str, reason: str) -> FieldMapping:
-        """Return the field of positions or goals in a unit or by LeRobot's calibration; ask without a unit."""
+        """Return the field of positions or goals, in a unit or by LeRobot's calibration; ask if there is no unit."""
         if unit:
             self.reasons[(*at, "unit")] = reason
         else:
@@ -454,21 +455,21 @@ class Proposal:
         return signal.mapped(unit)
 
     def in_lengths(self, fields: dict[str, FieldMapping]) -> dict[str, FieldMapping]:
-        """Return fields with the units of slides: lengths, or none where a robot has hinges and slides."""
+        """Return fields with units of length for slides; without units for a robot with hinges and slides."""
         slides = self.hints.slides
         found = dict(fields)
         for name, how in fields.items() if slides else ():
             if how.log_unit in _OF_SLIDES:
                 if how.unit != how.log_unit:
                     raise UsageError(
-                        f"{', '.join(how.sources)} is in {how.unit}, but {', '.join(slides)} slides",
+                        f"{', '.join(how.sources)} is in {how.unit}, but {', '.join(slides)} is a sliding joint",
                         hint="write a mapping with the scales to m and to rad: 0.001 for mm, 0.0174533 for degrees",
                     )
                 unit = _OF_SLIDES[how.log_unit] if len(slides) == len(self.hints.joints) else ""
                 found[name] = msgspec.structs.replace(how, unit=unit)
         return found
 
-    # -- what goes along, and what is left out
+    # -- further fields, and unused signals
 
     def add_extras(self, command: Signal, measured: Signal, places: Sequence[int]) -> None:
         """Add gains, torque on or off, further commands and payload, by their names."""
@@ -490,7 +491,7 @@ class Proposal:
     def add_velocities(
         self, command: Signal, measured: Signal, places: Sequence[int], t_s: dict[str, np.ndarray]
     ) -> None:
-        """Add velocities that are the rate of their positions, or of their goals."""
+        """Add velocities that are the derivative of the positions, or of the goals."""
         sides = {
             True: ("actuator", "goal_velocity", "goal", command),
             False: ("sensor", "velocity", "position", measured),
@@ -504,7 +505,7 @@ class Proposal:
                 continue
             if v.values.shape != of.values.shape:
                 continue
-            # Its unit is that of its name, else that of the positions; the data must agree.
+            # The unit comes from the name, else from the positions; the data must agree.
             unit = f"{s.meaning.unit or how.unit}/s"
             angle = checks.counted(in_si(how.unit)[0] * of.values, checks.TURN_RAD)
             if checks.is_rate(t_s[node], angle, in_si(unit)[0] * v.values):
@@ -526,20 +527,20 @@ class Proposal:
         if left:
             self.evidence.append(f"not imported: {', '.join(left[:20])}" + " ..." * (len(left) > 20))
 
-    # -- what the data say
+    # -- checks by the data
 
     def weigh(self, findings: Sequence[checks.Check], asked: tuple[str, str]) -> None:
-        """Refuse what contradicts the mapping, and ask what fits several mappings.
+        """Raise an error if data contradict the mapping, and ask if they fit several mappings.
 
         Args:
-            asked: Node and field whose unit is open where no position follows its goal.
+            asked: Node and field whose unit is asked for if no position follows its goal.
         """
         as_told = self.hints.as_told
         told = [f for f in findings if f.weight == "warn" or (as_told and f.weight != "note")]
         self.evidence += [f.text for f in findings if f.weight == "note"] + [f"warning: {f.text}" for f in told]
         open_ones = [f for f in findings if f.weight in ("ask", "refuse") and not as_told]
-        # One line of the mapping answers these; the others are wrong in the file.
-        # A joint of another scale than the others is refused by its name; if all are, their unit is open.
+        # One line of the mapping answers these findings; other findings mean that the file is wrong. A single joint
+        # with         # another scale is refused; if all joints have it, their unit is asked for.
         followed = any(f.name == "follows" and f.weight == "note" for f in findings)
         wrong = [f for f in open_ones if not f.question or (f.name == "slope" and f.weight == "refuse" and followed)]
         if wrong:
@@ -549,15 +550,15 @@ class Proposal:
             those = [f for f in open_ones if f.question == key]
             why = "; ".join(f.text for f in those)
             if self.hints.unit and all(f.name == "follows" for f in those):
-                self.evidence.append(f"warning: {why}")  # --unit has answered
+                self.evidence.append(f"warning: {why}")  # --unit has answered already
             else:
                 self.ask(asked if key == "unit" else ("actuator", "goal"), key, why, {f.joint for f in those})
 
     def ask(self, at: tuple[str, str], key: str, why: str, joints: Collection[int] = ()) -> None:
-        """Ask for a line of a field that the data do not prove.
+        """Ask for a line of the mapping that the data do not prove.
 
         Args:
-            joints: Numbers of the joints that it concerns.
+            joints: Numbers of the joints that the question is about.
         """
         how = self.mapping.nodes[at[0]].fields[at[1]]
         scale = np.broadcast_to(how.scale, (len(self.joints),)).tolist()
@@ -570,7 +571,7 @@ class Proposal:
 
 
 def _rank(named: Meaning, side: str) -> int | None:
-    """Return how well a name fits the measured positions or the commands, 0 best; None: not at all."""
+    """Return how well a name fits measured positions or commands, 0 being best; None: not at all."""
     position = named.quantity == "position"
     if side == "measured":
         if not position and named.quantity:
@@ -584,14 +585,14 @@ def _rank(named: Meaning, side: str) -> int | None:
 
 
 def _written(signal: Signal) -> str:
-    """Return the source of a signal as a mapping file has it, shortened."""
+    """Return the source of a signal as in a mapping file, shortened."""
     if signal.whole or signal.width == 1:
         return json.dumps(signal.whole or signal.sources)
     return json.dumps(signal.sources[:1])[:-1] + ", ...]"
 
 
 def _in_order(signal: Signal, measured: Signal, places: Sequence[int]) -> Signal | None:
-    """Return the columns of the joints, or one for all; None if they do not fit."""
+    """Return the columns of the joints, or one column for all joints; None if they do not fit."""
     if all(signal.labels) and all(measured.labels) and set(measured.labels) <= set(signal.labels):
         return signal.taken([signal.labels.index(label) for label in measured.labels])
     if signal.width in (1, len(places)):
@@ -600,7 +601,7 @@ def _in_order(signal: Signal, measured: Signal, places: Sequence[int]) -> Signal
 
 
 def _stamp_unit(stamps: Signal) -> tuple[str, str]:
-    """Return the unit of stamps and the reason; or no unit and the candidates."""
+    """Return the unit of stamps and the reason; or no unit, and the candidates."""
     if stamps.meaning.unit in STAMP_UNITS:
         return stamps.meaning.unit, "unit by its name"
     values = stamps.values[np.isfinite(stamps.values[:, 0]), 0]
@@ -616,7 +617,7 @@ def _stamp_unit(stamps: Signal) -> tuple[str, str]:
 
 
 def _apart_s(header: np.ndarray, log: np.ndarray) -> float:
-    """Return by how much two clocks [ns] drift apart, without the few messages that came late."""
+    """Return by how much two clocks [ns] drift apart [s], ignoring a few late messages."""
     apart = 1e-9 * (header - log)
     return max(float(np.ptp(np.quantile(apart, (0.05, 0.95)))), abs(float(apart[-1] - apart[0])))
 
@@ -637,7 +638,7 @@ def _may_be_stamps(signal: Signal, count: int) -> bool:
 
 
 def joint_motion(table: Table, joints: Sequence[str], unit: str) -> tuple[np.ndarray, np.ndarray, str]:
-    """Return the motion of a robot's joints in a table: goals if it has them, otherwise positions.
+    """Return the motion of a robot's joints in a table: its goals, or if it has none, its positions.
 
     Args:
         joints: Names of the commands, by which columns are chosen.
@@ -647,7 +648,7 @@ def joint_motion(table: Table, joints: Sequence[str], unit: str) -> tuple[np.nda
         Times ``(N,)`` [s], values ``(N, joints)`` [unit], and their source in words.
 
     Raises:
-        UsageError: When no columns have these names, or their clock or unit is open.
+        UsageError: No columns have these names, or their clock or unit is unclear.
     """
     of = Proposal(table, ImportHints("", joints=tuple(joints)))
     motions = []
@@ -661,7 +662,7 @@ def joint_motion(table: Table, joints: Sequence[str], unit: str) -> tuple[np.nda
     if not motions:
         raise UsageError(
             f"{table.path} has no columns for {', '.join(joints)}. Columns: {', '.join(table.keys[:30]) or 'none'}",
-            hint=f"name them by joint, quantity and unit, such as {joints[0]}_goal_rad, and the time t_s",
+            hint=f"name the columns by joint, quantity and unit, such as {joints[0]}_goal_rad, and the time t_s",
         )
     signal = min(motions, key=lambda s: (s.meaning.side != "command", s.meaning.quantity != "position"))
     clock, _ = of.clock(signal, "motion")

@@ -1,4 +1,4 @@
-"""Reads the files of other recorders as tables: npz, JSON and CSV here, bags and LeRobot data sets beside."""
+"""Reads files of other recorders as tables: npz, JSON and CSV; bags.py and lerobot.py read the other formats."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ _OTHERS = {
     b"\x80\x04": _PICKLE,
     b"\x80\x05": _PICKLE,
 }  # fmt: skip
-"""First bytes -> what the file is, and the command that converts it."""
+"""First bytes -> name of the file format, and the command that converts it."""
 
 
 @dataclass
@@ -73,14 +73,14 @@ class Table:
         path: The file or folder.
         format: ``npz``, ``json``, ``csv``, ``mcap`` or ``lerobot``.
         columns: Name -> values, shape ``(N, ...)``, or ``()`` for a constant: float64, float32 or int64.
-        words: Name -> texts of a signal of words.
-        names: Signal of two dimensions -> names of its columns.
+        words: Name -> texts, of a signal of words.
+        names: Name of a signal with two dimensions -> names of its columns.
         broken: Name -> why the signal cannot be read.
-        notes: Sentences on what was left out.
-        nominal: Stamps that are computed from a rate.
+        notes: Sentences on parts that were left out.
+        nominal: Names of stamps that were computed from a rate.
         robot: Robot type of a LeRobot data set.
         beside: Further files of the same recording.
-        stems: Beginnings of the names of several files' signals: ``STEM/``.
+        stems: Prefixes ``STEM/`` of signals, if they come from several files.
     """
 
     path: Path
@@ -101,7 +101,7 @@ class Table:
         return [*self.columns, *self.words, *self.broken]
 
     def cut(self, samples: slice) -> Table:
-        """Return a range of samples of all signals that are as long as the longest one."""
+        """Return a range of samples of all signals with the greatest length."""
         longest = max((len(v) for v in self.columns.values() if v.ndim), default=0)
         columns = {n: v[samples] if v.ndim and len(v) == longest else v for n, v in self.columns.items()}
         return replace(self, columns=columns)
@@ -128,14 +128,14 @@ class Table:
                 np.where(np.isnat(values), np.nan, nanoseconds) if np.isnat(values).any() else nanoseconds
             )
         elif kind in "iu" and not (values.size and values.max() > np.iinfo(np.int64).max):
-            self.columns[name] = values.astype(np.int64)  # exact, as float64 would round stamps in nanoseconds
+            self.columns[name] = values.astype(np.int64)  # integers: float64 would round stamps in nanoseconds
         elif kind in "fiub":
             self.columns[name] = values if values.dtype == np.float32 else values.astype(np.float64)
         else:
             self.broken[name] = f"it holds no numbers, but {values.dtype}"
 
     def add_texts(self, name: str, texts: list[str], lines: Sequence[int] = ()) -> None:
-        """Add a signal that is written as texts: numbers, dates or words, at these lines of a file."""
+        """Add a signal written as text: numbers, dates or words, at these lines of a file."""
         column = numbers(texts)
         if isinstance(column, str):
             where = f"line {lines[texts.index(column)]}" if lines else "it"
@@ -149,10 +149,10 @@ class Table:
         """Return a signal.
 
         Args:
-            source: Its name; ``[:,0]`` or ``[:,1:3]`` after the name selects columns.
+            source: Name; ``[:,0]`` or ``[:,1:3]`` after the name selects columns.
 
         Raises:
-            UsageError: When the signal or column does not exist, or holds other values than numbers.
+            UsageError: The signal or column does not exist, or has values that are no numbers.
         """
         name, chosen = source, None
         match = re.fullmatch(r"(.+)\[\s*:\s*,\s*(-?\d+|-?\d*\s*:\s*-?\d*)\s*\]", source)
@@ -186,16 +186,16 @@ class Table:
 
 
 def open_tables(path: Path, episode: int | None = None) -> list[Table]:
-    """Read a file of another recorder, the folder of a ROS 2 bag, or that of a LeRobot data set.
+    """Read a file of another recorder, or the folder of a ROS 2 bag or a LeRobot data set.
 
     Args:
         episode: Number of an episode of a LeRobot data set; None: all of them.
 
     Returns:
-        One table; of a LeRobot data set one for each episode.
+        One table; for a LeRobot data set, one for each episode.
 
     Raises:
-        UsageError: When the file does not exist, or its content cannot be read; a container is named with the command
+        UsageError: The file does not exist, or its content cannot be read; for a container, the error has the command
             that converts it.
     """
     from sim2real.log.importing import bags, lerobot  # imported late: they need their packages
@@ -231,7 +231,7 @@ def open_tables(path: Path, episode: int | None = None) -> list[Table]:
     data = path.read_bytes()
     try:
         text = data.decode("utf-8-sig")
-    except UnicodeDecodeError:  # such as the degree sign of a program on Windows
+    except UnicodeDecodeError:  # such as a degree sign in a Windows encoding
         text = data.decode("cp1252", errors="replace")
     return [_read_json(path, text) if text.lstrip()[:1] in ("{", "[") else _read_csv(path, text)]
 
@@ -245,7 +245,7 @@ def open_table(path: Path, episode: int | None = None) -> Table:
 
 
 def refuse_container(path: Path, head: bytes) -> None:
-    """Raise an error for a container of another kind, which names the command that converts it."""
+    """Raise an error for a container that is not read, with the command that converts it."""
     for magic, (what, command) in _OTHERS.items():
         if head.startswith(magic):
             raise UsageError(f"{path} is {what}, which import does not read", hint=f"first: {command}")
@@ -286,7 +286,7 @@ def _read_json(path: Path, text: str) -> Table:
         except json.JSONDecodeError:
             document = [json.loads(line) for line in text.splitlines() if line.strip()]  # an object on each line
             if all(isinstance(row, dict) and {"topic", "log_time", "data"} <= row.keys() for row in document):
-                from sim2real.log.importing import bags  # imported late, as above
+                from sim2real.log.importing import bags  # imported late: it needs a package
 
                 return bags.read_messages(path, document)
         for name, value in _leaves({"": document} if isinstance(document, list) else document, path):
@@ -301,7 +301,7 @@ def _read_json(path: Path, text: str) -> Table:
 
 
 def _leaves(value: Json, path: Path, trail: str = "") -> Iterator[tuple[str, Json]]:
-    """Yield path and value of all leaves; a list of objects has the paths of its objects, after ``[]``."""
+    """Yield path and value of all leaves; ``[]`` in a path stands for the objects of a list."""
     if isinstance(value, dict):
         for key, item in value.items():
             yield from _leaves(item, path, f"{trail}.{key}".lstrip("."))
@@ -317,7 +317,7 @@ def _leaves(value: Json, path: Path, trail: str = "") -> Iterator[tuple[str, Jso
 
 
 def _read_csv(path: Path, text: str) -> Table:
-    """Read a text with separators: the line before the first numbers has the names, also if it is a comment."""
+    """Read a text with separators; the line before the first numbers has the names, even if it is a comment."""
     table = Table(path, "csv")
     lines = [(i, x) for i, x in enumerate(text.splitlines(), 1) if x.strip() and not re.fullmatch("sep=.", x.strip())]
     body = [(i, line) for i, line in lines if not _COMMENT.match(line)]
@@ -325,7 +325,7 @@ def _read_csv(path: Path, text: str) -> Table:
     rows = [(i, _cells(line, separator)) for i, line in body]
     counts = Counter(len(cells) for _, cells in rows)
     width = counts.most_common(1)[0][0] if counts else 0
-    # The data begin with the first row of the usual width that holds a number.
+    # The data begin at the first row that has the usual width and a number.
     first = next((k for k, (_, c) in enumerate(rows) if len(c) == width and any(map(_is_number, c))), None)
     if first is None:
         raise UsageError(f"{path} holds no line of numbers", hint="it needs a line of names, then lines of numbers")
@@ -340,7 +340,7 @@ def _read_csv(path: Path, text: str) -> Table:
     elif skipped := [i for i, _ in lines if i < at]:
         table.notes.append(f"skipped: {len(skipped)} lines before the names in line {at}")
     if len(data) > 1 and (len(data[-1][1]) < width or not text.endswith(("\n", "\r"))):
-        # A number that was cut is another number.
+        # A file that was cut may end within a number.
         table.notes.append(f"the last line of {path.name} has no end: it is left out")
         data = data[:-1]
     if wrong := next(((i, cells) for i, cells in data if len(cells) != width), None):
@@ -359,10 +359,10 @@ def _read_csv(path: Path, text: str) -> Table:
 
 
 def _is_unclear(data: Sequence[tuple[int, list[str]]], width: int, is_nameless: bool, has_words: bool) -> str:
-    """Return why the first row may be the names of the columns, or a sample; empty if it is clear."""
+    """Return why it is unclear whether the first row has names or a sample; empty if it is clear."""
     first, below = data[0][1], [cells for _, cells in data[1:20] if len(cells) == width]
     for i, cell in enumerate(first):
-        # A word above numbers; where words follow below, the column holds words.
+        # A word above numbers is a name; above words, it may be a value.
         is_word = not _is_number(cell) and cell.strip().lower() not in _NULL
         if is_word and below and all(_is_number(cells[i]) for cells in below):
             return f"mixes numbers with {cell.strip()!r}, above numbers: is it a line of names, or a damaged sample?"
@@ -375,14 +375,14 @@ def _is_unclear(data: Sequence[tuple[int, list[str]]], width: int, is_nameless: 
 
 
 def _names(above: Sequence[tuple[int, str]], separator: str | None, width: int) -> tuple[list[str] | None, int]:
-    """Return the names of the columns, None without any, and the number of their line.
+    """Return the names of the columns (None without names), and the number of their line.
 
-    Below the names there may be a line of units; above names that repeat, a line of groups.
+    Below the names there may be a line of units; above names that repeat, a line of names of groups.
     """
     below: list[str] = []
     for i, line in reversed(above):
         text = _COMMENT.sub("", line, count=1) if _COMMENT.match(line) else line
-        # The line of names may be separated in another way than the numbers.
+        # The line of names may have another separator than the numbers.
         split = [[c.strip() for c in _cells(text, by)] for by in (separator, ",", None)]
         cells = next((cells for cells in split if len(cells) == width and any(cells)), None)
         if cells is not None and below:
@@ -391,13 +391,13 @@ def _names(above: Sequence[tuple[int, str]], separator: str | None, width: int) 
             if len({*cells}) == width > 1 and not all(map(is_unit, cells)):
                 return cells, i
             below, at = cells, i
-        elif not _COMMENT.match(line):  # a line of another width is text, and above it there are no names
+        elif not _COMMENT.match(line):  # a line of another width is text: no names stand above it
             break
     return (below, at) if below else (None, 0)
 
 
 def numbers(texts: Sequence[str]) -> np.ndarray | str | None:
-    """Return texts as numbers, dates as nanoseconds since 1970; a word among numbers; None for words alone."""
+    """Convert texts to numbers, and dates to nanoseconds since 1970; return a word among numbers; None for words."""
     for kind in (int, float):
         try:
             return np.array([kind(t) for t in texts], np.int64 if kind is int else np.float64)
@@ -434,7 +434,7 @@ def _is_number(cell: str) -> bool:
 
 
 def _separator(lines: Sequence[str]) -> str | None:
-    """Return the separator that splits most lines alike; None: blanks."""
+    """Return the separator that splits most lines into the same number of cells; None: blanks."""
     best: tuple[int, str | None] = (0, None)
     for separator in (";", "\t", "|", ","):
         counts = Counter(len(_cells(line, separator)) for line in lines)
@@ -451,10 +451,10 @@ def _cells(line: str, separator: str | None) -> list[str]:
 
 
 def joined(tables: Sequence[Table]) -> Table:
-    """Return several files of one recording as one, whose signals are named ``STEM/NAME``.
+    """Join several files of one recording to one table, whose signals are named ``STEM/NAME``.
 
     Raises:
-        UsageError: When two files have the same name.
+        UsageError: Two files have the same name.
     """
     if len({t.path.stem for t in tables}) < len(tables):
         raise UsageError(

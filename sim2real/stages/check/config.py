@@ -20,17 +20,17 @@ class CheckConfig:
     plan: bool = False
     """Judge the planned excitation even if there is a recording."""
     bounds: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Bounds of a parameter instead of the pipeline's: one flag a parameter."""
+    """Bounds of a parameter instead of the pipeline's; repeat the flag for each parameter."""
     fix: dict[str, float] = field(default_factory=dict)
-    """Value at which a parameter is fixed: one flag a parameter."""
+    """Value at which a parameter is fixed; repeat the flag for each parameter."""
     world: str | None = None
-    """World of an installed package whose parameters are judged; default: the robot's own."""
+    """World of an installed package in which parameters are judged; default: the robot's own."""
     json: bool = False
     """Print JSON instead of tables."""
     runs: Path = Path("runs")
     """Folder of all runs."""
     record: RecordConfig = field(default_factory=RecordConfig)
-    """The excitation that is planned."""
+    """The planned excitation."""
 
     def __post_init__(self) -> None:
         """Check the fields."""

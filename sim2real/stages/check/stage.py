@@ -39,14 +39,14 @@ from sim2real.types import Json
 
 PLANNED = "planned excitation"
 _GOAL = 0.01
-"""Standard error to reach, as a fraction of the nominal value."""
+"""Desired standard error, as a share of the nominal value."""
 _MIN_SEGMENT_S = 0.3
 _MAX_SEGMENTS = 120
-"""Of a longer log this many segments are simulated, evenly distributed: more do not change the result."""
+"""Most segments that are simulated, evenly distributed over the log: more do not change the result."""
 _GAP = 2.5
 """Pauses longer than this many periods are gaps."""
 _STILL = 0.05
-"""A joint stands still below this share of its highest speed, or below three deviations of a measured speed."""
+"""A joint rests below this share of its highest speed, or below three standard deviations of a measured speed."""
 _NOISE_ORDER = 6
 """Differences of this order keep 0.2 % of a motion at a tenth of the sampling rate, and all white noise."""
 _WINDOW_S = 0.03
@@ -81,7 +81,7 @@ class Coverage:
         rate_hz: Median rate [Hz].
         gaps: Number of pauses longer than two and a half periods.
         longest_gap_s: 0 without gaps [s].
-        doubts: Sentences on a torque that may be no command.
+        doubts: Sentences on a recorded torque that may be no command.
         too_seldom: Sentences on commands or measurements that are logged too seldom for the motion.
     """
 
@@ -128,7 +128,7 @@ class Coverage:
 
 @dataclass(frozen=True)
 class ParameterCheck:
-    """What recordings say of one parameter.
+    """How well recordings determine one parameter.
 
     Attributes:
         standard_error_per_minute: Standard error to expect from one minute of such data.
@@ -171,12 +171,12 @@ class Checked(Shown):
 
     @property
     def too_seldom(self) -> bool:
-        """Whether a side is logged too seldom: the motion between its samples is unknown, whatever a model says."""
+        """Whether commands or measurements are logged too seldom, so that the motion between them is unknown."""
         return any(r.too_seldom for r in self.recordings)
 
     @property
     def in_groups(self) -> tuple[str, ...]:
-        """The parameters that the data does not determine alone."""
+        """The parameters that the data determines only in combination."""
         return tuple(dict.fromkeys(name for group in self.undetermined for name in group))
 
     @property
@@ -266,7 +266,7 @@ def check(
     Raises:
         NotInstalled: JAX is not installed; the coverage of the recordings is printed before.
     """
-    # Make the model that identify would fit.
+    # Make the model that `identify` would fit.
     robot = robot_of(robot)
     config = config_of(config, CheckConfig(record=defaults_of(robot).record))
     robot = in_world(robot, config.world)
@@ -284,7 +284,7 @@ def check(
         config, planned = replace(config, log=tuple(str(log.path) for log in recordings), plan=False), False
         logs = {shown(log.path): log.episode for log in recordings}
     model = measured_channels(model, list(logs.values()))
-    # Refuse logs that no parameter can be determined from, also without JAX.
+    # Refuse logs that determine no parameter, even without JAX.
     for episode in logs.values():
         check_log(episode, model)
     covered = tuple(coverage(name, episode, model, robot.units) for name, episode in logs.items())
@@ -346,7 +346,7 @@ def _planned(
             hint="record it, play it with `sim2real record PIPELINE --excitation LOG`, and check that",
         )
     if config.record.standing:
-        raise UsageError("a recording of standing determines the load alone", hint="plan another --record.excitation")
+        raise UsageError("a recording of standing determines only the load", hint="plan another --record.excitation")
     if not has_jax():
         raise NotInstalled("a plan is simulated with JAX, which is not installed here", hint="name a log with --log")
     from sim2real.stages.session.simulated_log import simulate  # JAX programs
@@ -388,7 +388,7 @@ def coverage(name: str, episode: Episode, model: IdentifiableModel, units: Mappi
 
 
 def _commands(episode: Episode, model: IdentifiableModel, units: dict[str, str]) -> Iterator[SignalCoverage]:
-    """Yield each command, named by its joint where the field has a value for each joint."""
+    """Yield each command, named by its joint if the field has a value for each joint."""
     for node, message in model.given.items():
         for field in pytree.leaves(message):
             values = np.asarray(episode.outputs[node][field], np.float64)
@@ -414,19 +414,19 @@ def sampling(t_s: np.ndarray) -> tuple[int, float, float]:
 
 
 def speed(t_s: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Return the rate of a sampled position ``(N,)``, by differences; 0 with fewer than three samples."""
+    """Return the speed of a sampled position ``(N,)``, by differences; 0 with fewer than three samples."""
     if len(position) < 3:
         return np.zeros(len(position))
     times = np.asarray(t_s, np.float64)
-    steps = np.maximum(np.diff(times), 1e-9)  # equal stamps must not make it infinite
+    steps = np.maximum(np.diff(times), 1e-9)  # equal stamps must not make the speed infinite
     return np.gradient(np.asarray(position, np.float64), times[0] + np.concatenate([[0.0], np.cumsum(steps)]))
 
 
 def motion_of(t_s: np.ndarray, position: np.ndarray) -> tuple[float, float]:
     """Return the share of the time in motion, and the share of it upwards, of a joint.
 
-    Speeds are those of positions averaged over 30 ms, so that the noise of fast samples does not hide slow motion;
-    noise, glitches and quantisation are no motion.
+    Positions are averaged over 30 ms, so that the noise of fast samples does not hide slow motion; noise, glitches and
+    quantisation do not count as motion.
 
     Args:
         t_s: Times ``(N,)`` [s].
@@ -436,7 +436,7 @@ def motion_of(t_s: np.ndarray, position: np.ndarray) -> tuple[float, float]:
     good = np.isfinite(position) & np.isfinite(t_s)
     t_s, position, noise = t_s[good], position[good], 0.0
     if len(position) >= 3 * _NOISE_ORDER:
-        # The deviation of white noise, by high differences without the largest 2 %, which are leaps.
+        # The standard deviation of white noise, by high-order differences without the largest 2 %, which are leaps.
         squares = np.sort(np.diff(position, _NOISE_ORDER) ** 2)[: math.ceil(0.98 * (len(position) - _NOISE_ORDER))]
         noise = float(np.sqrt(squares.mean() / math.comb(2 * _NOISE_ORDER, _NOISE_ORDER)))
         width = min(max(1, round(_WINDOW_S / max(float(np.median(np.diff(t_s))), 1e-9))), len(position) // 3)

@@ -1,1 +1,1 @@
-"""The stage deploy: the policy on the robot, beside the same policy in simulation."""
+"""The stage deploy: runs the policy on the robot, and compares with the same policy in simulation."""

@@ -27,13 +27,15 @@ class DeployConfig(SessionConfig):
     delay_tolerance_s: float = 0.008
     """Largest distance of the measured delay from the delays of training [s]."""
     force: bool = False
-    """Deploy with a warning if the measured delay is none of the delays of training, or the policy is of a robot on
-    another kind of port."""
+    """Deploy, with a warning, even if the measured delay is outside of the delays of training, or if the policy was
+    trained for the emulated robot and this is the real one, or the reverse.
+    """
     hold: bool = False
     """Hold the robot at the end of an episode, or after Ctrl-C, until Enter is pressed: it may fall without torque."""
     command: Annotated[tuple[float, float, float] | None, Flag("X Y YAW")] = None
-    """Commanded velocity of a robot that walks: forwards, to the left [m/s], yaw rate [rad/s]; default: each episode
-    has four of its own."""
+    """Commanded velocity of a walking robot: forwards, to the left [m/s], yaw rate [rad/s]; default: four commands for
+    each episode.
+    """
     max_tilt_rad: float | None = None
     """Largest tilt [rad]; a robot that measures its tilt stops above it. Default: no limit."""
 

@@ -38,7 +38,7 @@ def run_episodes(
 
     Args:
         logs: The files to write, all in the folder of the deployment.
-        following: How the joints follow their commands, by the identified model; None: as the device says.
+        following: How the joints follow their commands, by the identified model; None: by the device's `following`.
 
     Raises:
         Sim2RealError: The cause that stopped the robot.
@@ -62,7 +62,7 @@ def run_episodes(
 
 
 def _announce_following(following: Following | None) -> None:
-    """Print by which figures joints are watched that do not follow their commands; or that none are."""
+    """Print the limits by which joints count as not following their commands, or that none are checked."""
     if following is None:
         note("no motor is watched for letting go: how it follows its commands is not known, or following_rad is inf")
         return
@@ -96,14 +96,14 @@ def _run_one(bench: Bench, policy: Runner, config: DeployConfig, trial: int, log
     bench.run_episode(nodes, params, log, config.duration_s, "deploy", config.hold)
 
 
-# -- the test of the delay, and its log: the model is tested on it as on an episode
+# -- the test of the delay, and its log, on which the model is tested like on an episode
 
 
 def check_delay(probe: Probe, witness: Witness, contract: PolicyContract, config: DeployConfig) -> str:
     """Return the delay as a text, measured with small steps; refuse a policy that was not trained with it.
 
     Args:
-        witness: Holds the open robot, at rest and without torque; records the commands and the measurements.
+        witness: Has the open robot, at rest and without torque; records commands and measurements.
 
     Raises:
         DelayChanged: The delay, or its variation, lies outside of the range in training.
@@ -112,7 +112,7 @@ def check_delay(probe: Probe, witness: Witness, contract: PolicyContract, config
     if (trained := contract.trained_s.get(ROUND_TRIP)) is None:
         note("warning: the bundle does not list the delays of its training, so the robot's delay is not measured")
         return ""
-    # A busy machine may delay single steps, so a misfit is measured a second time.
+    # A busy machine may delay single steps, so measure a misfit a second time.
     answers = measure_delay(witness, probe)
     if misfit(answers, trained, config.delay_tolerance_s):
         witness.rig.wait_until_still(config.settle_s)
@@ -124,7 +124,7 @@ def check_delay(probe: Probe, witness: Witness, contract: PolicyContract, config
         if not config.force:
             raise DelayChanged(
                 message,
-                hint="record, identify and train again, or see where the delay is in the report of a recording; to "
+                hint="record, identify and train again, or look for the delay in the report of a recording; to "
                 "deploy all the same: --force",
             )
         note(f"warning: {message}")
@@ -132,11 +132,11 @@ def check_delay(probe: Probe, witness: Witness, contract: PolicyContract, config
 
 
 def misfit(answers: StepAnswers, trained: tuple[float, float], tolerance_s: float) -> str | None:
-    """Return why a measured delay is none of the delays in training; None if it is one of them.
+    """Return why a measured delay lies outside of the delays in training; None if it lies among them.
 
     Args:
         trained: Shortest and longest delay of the training [s].
-        tolerance_s: Allowed distance from these, and allowed additional variation [s].
+        tolerance_s: Allowed distance from these two, and allowed additional variation [s].
     """
     low, high = trained
     shortest, longest = answers.between_s
@@ -148,14 +148,14 @@ def misfit(answers: StepAnswers, trained: tuple[float, float], tolerance_s: floa
 
 
 def _write_probe(log: Path, robot: Robot, witness: Witness) -> None:
-    """Write the commands and measurements of the steps at the robot's rate; without a step nothing.
+    """Write the commands and measurements of the steps at the robot's rate; write nothing if there was no step.
 
-    The steps ran faster than that. The log omits the measurements in between, so that a second of it weighs as much as
-    a second of any other log, and it omits repeated commands.
+    The steps were measured at a higher rate. The log omits measurements in between, so that a second of it weighs as
+    much as a second of another log, and it omits repeated commands.
     """
     if not witness.measured or not witness.sent:
         return
-    # Select the measurements and commands at the robot's rate; a command that changes is always selected.
+    # Select measurements and commands at the robot's rate, and every command that changes.
     period_ns, start_ns = round(1e9 / robot.drive.rate_hz), min(witness.measured[0][0], witness.sent[0][0])
     measured = _apart([begin_ns for begin_ns, *_ in witness.measured], period_ns)
     changed = [i == 0 or not np.array_equal(goal, witness.sent[i - 1][2]) for i, (*_, goal) in enumerate(witness.sent)]
@@ -177,7 +177,7 @@ def _write_probe(log: Path, robot: Robot, witness: Witness) -> None:
 
 
 def _apart(times_ns: list[int], period_ns: int, always: list[bool] | None = None) -> list[int]:
-    """Return the indices of times that are at least a period apart, and of those that ``always`` marks."""
+    """Return the indices of times that are at least a period apart, and of times that ``always`` marks."""
     selected: list[int] = []
     for i, t_ns in enumerate(times_ns):
         if not selected or t_ns - times_ns[selected[-1]] >= period_ns or (always is not None and always[i]):

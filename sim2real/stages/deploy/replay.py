@@ -1,4 +1,4 @@
-"""Replay of a deployment: its commands drive the models of its robot, and its log tests the parameters."""
+"""Replay of a deployment: predicts its motion from its commands, and tests whether parameters have changed."""
 
 import math
 from collections.abc import Container, Mapping, Sequence
@@ -24,13 +24,14 @@ from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.shared.identification import identified_robot, side_by_side
 
 _REPETITIONS = 16
-"""Measurements with noise, from which the errors of an unchanged robot follow."""
+"""Number of simulated noisy measurements, which give the errors of an unchanged robot."""
 _SEGMENT_S = 0.4
 """Shortest segment [s]. Errors of a balanced pendulum grow tenfold in 0.2 s, so long segments do not separate
 models."""
 _MARGIN = 1.25
-"""The expected error of a deployment over that of the held-out parts: a policy moves otherwise. Without it an unchanged
-pendulum was 6 % above, with the parameters of its own log, too."""
+"""Factor from the expected error of held-out parts to that of a deployment, as a policy moves differently. Without it,
+the error of an unchanged pendulum was 6 % too large, even with the parameters of its own log.
+"""
 _LEAST, _LEAST_S = 4, 5.0
 """Fewest segments with motion for a test, and the shortest length of all logs [s]."""
 
@@ -40,15 +41,15 @@ def tested(
 ) -> tuple[list[ComparedError], Drift]:
     """Replay recorded commands on the identified and the nominal model, and test the parameters.
 
-    The measurements are compared with those of the simulated sensor, with its delay, at the log's times.
+    The measurements are compared with the simulated sensor's, which are delayed, at the log's times.
 
     Raises:
-        Sim2RealError: When the logs are too short, or the identification does not fit the robot.
+        Sim2RealError: The logs are too short, or the identification does not fit the robot.
     """
     robot, config = identified_robot(identification, robot)
     problem, ahead_s = _problem(robot, identification, episodes, config)
     posterior = identification.needed_posterior()
-    # Test each parameter, and fit all of them to this log.
+    # Test each parameter for a change, and fit all of them to this log.
     drifted, x = drift_test.drift(problem, posterior, posterior.widening)
     z = refine(problem, problem.table.within(x)[None], gain=problem.precision).x
     refitted = {n: float(np.ravel(v)[0]) for n, v in problem.table.decode(z).items()}
@@ -63,7 +64,7 @@ def tested(
     columns = prediction.samples(problem, models, config.settle_s, all_segments)
     measured = positions(problem.model, robot.units)
     errors = prediction.errors(columns, list(models), measured, config.settle_s, ahead_s)
-    # Predict the model's own motion from readings with noise: the errors of a robot that has not changed.
+    # Predict simulated motion from noisy readings: such errors occur even if the robot has not changed.
     noise = identification.noise
     alike = _of_noise(problem, measured, columns, noise, models["identified"], config.settle_s, ahead_s)
     # Compare the errors with those on the identification's held-out parts.
@@ -76,7 +77,7 @@ def tested(
             expected = expected_at(identification, row.joint, expected)
             expected = max(expected, NOISE * sigmas[row.joint]) * max(1.0, now / moved if now and moved else 1.0)
             expected = _MARGIN * math.hypot(expected, alike.get(row.joint, 0.0))
-            # A model that diverges on its own motion bounds nothing.
+            # If predictions of simulated motion diverge, there is no bound.
             expected = expected if math.isfinite(expected) else None
         rows.append(replace(row, log="this deployment", expected=expected, as_good=()))
     return rows, drifted
@@ -88,7 +89,7 @@ def _problem(
     """Return later logs in short segments, with the identified parameters, and the horizon of the predictions [s].
 
     Raises:
-        Sim2RealError: When the logs are too short or of another motion.
+        Sim2RealError: The logs are too short, or of another motion.
     """
     model = watched(robot, config.max_delay_s)
     if isinstance(model, ChecksLogs):
@@ -107,7 +108,7 @@ def _problem(
         moving = f", {length_s * len(spans):.1f} s of them in motion,"
         raise Sim2RealError(f"{seconds:.1f} s of deployment{moving} are too little to test the model on")
 
-    # Free the parameters that may have changed since.
+    # Free the parameters that may have changed since the identification.
     identified = {p.name for p in robot.identifiable(config.max_delay_s).parameters if p.free}
     changeable = {p.name for p in model.parameters if p.free} - identified
     table = _table(model.parameters, identification, changeable)
@@ -115,7 +116,7 @@ def _problem(
 
 
 def _table(parameters: ParameterTable, identification: Identification, watched: Container[str] = ()) -> ParameterTable:
-    """Return parameters with the identified terms, the values that were fixed, and bounds that include the search's.
+    """Return parameters with the identified terms, fixed values, and bounds at least as wide as in the search.
 
     Args:
         watched: Names of parameters that are free although they were fixed, such as a payload.
@@ -137,7 +138,8 @@ def _table(parameters: ParameterTable, identification: Identification, watched: 
 def _moves(model: IdentifiableModel, episode: Episode, begin_s: float, length_s: float) -> bool:
     """Return whether any joint moves in a part of a log [s].
 
-    Segments without motion do not count: all are alike, and a joint that sticks creeps in a model with smooth friction.
+    Segments without motion do not count: they tell nothing, and in a model with smooth friction a sticking joint
+    creeps.
     """
     t = episode.steps[model.sensor].begun_s
     inside = (t >= begin_s) & (t <= begin_s + length_s)
@@ -157,14 +159,14 @@ def _of_noise(
     settle_s: float,
     ahead_s: float,
 ) -> dict[str, float]:
-    """Return the error below which 95 % of the predictions of the model's own motion stay: joint -> error.
+    """Return joint -> the error below which 95 % of the predictions of simulated motion stay.
 
-    Their measurements are the predictions with noise. Beside an unstable equilibrium, as of a balanced pendulum, the
-    errors of an initial state grow so fast that the best model has them.
+    The simulated measurements are predictions plus noise. Near an unstable equilibrium, as of a balanced pendulum,
+    errors of an initial state grow so fast that even the best model has large errors.
 
     Args:
-        columns: Predictions of the model ``identified``, as ``prediction.samples`` returns them.
-        values: Its parameters.
+        columns: Predictions of the model ``identified``; see ``predictions.samples``.
+        values: Parameters of this model.
     """
     rng, at, every = np.random.default_rng(0), np.nonzero(problem.ts >= 0), np.ones(problem.segments, bool)
     fields = {n.field: n for n in noise if f"{n.field}_identified" in columns}
@@ -187,7 +189,7 @@ def _of_noise(
 
 
 def _held_out(identification: Identification, model: str, ahead_s: float) -> Mapping[str, float]:
-    """Return the error of a model on the identification's held-out parts: joint -> error."""
+    """Return joint -> error of a model on the identification's held-out parts."""
     rows = [row for row in identification.errors if not row.log and row.seconds == ahead_s]
     errors = {row.joint: row.error if model == "identified" else row.baselines.get(model) for row in rows}
     return {joint: error for joint, error in errors.items() if error is not None}

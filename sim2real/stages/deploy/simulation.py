@@ -22,7 +22,7 @@ from sim2real.stages.terminal.interruption import patiently
 
 _MIN_SIMULATIONS, _MIN_PER_EPISODE = 32, 8
 _LATENESS_PERIODS = 0.1
-"""A step is late if it exceeds the longest of training by this share of the policy's period."""
+"""A step is late if it takes longer than the longest of training by this share of the policy's period."""
 
 
 def compare(
@@ -34,12 +34,12 @@ def compare(
 ) -> Deployment:
     """Return the table of a deployment's episodes: scores on the robot and in simulation, late steps and pauses.
 
-    Scores compare states of one kind: true states if every recording has them, else states as the sensor measures
-    them.
+    Scores on both sides use true states if every recording has them, else measured states.
 
     Args:
-        identification: Parameters of the simulations; None: none, except for a robot that is simulated in plain
-            MuJoCo. The first simulation of each episode has the estimates, the others are draws from the posterior.
+        identification: Parameters of the simulations; None: no simulation, except for a walking robot, which then has
+            nominal values. The first simulation of each episode has the estimates, the others have draws from the
+            posterior.
         duration_s: Length of a simulation [s].
     """
     use_truth = all(r.true_states() is not None for r in recordings)
@@ -47,7 +47,7 @@ def compare(
     count, rows = len(recordings), []
     for i, recording in enumerate(recordings):
         real = _finite(robot.task.score(*_recorded(recording, robot, use_truth)))
-        # Simulation e is of episode e % count.
+        # Simulation e belongs to episode e % count.
         scores = [_finite(robot.task.score(t_s, states)) for (t_s, states), _ in pairs[i::count]]
         simulation = {name: mean([score.get(name) for score in scores]) for name in real} if scores else {}
         rows.append(EpisodeRow(real, simulation, late_shares(recording, bundle), paused_s(recording)))
@@ -70,7 +70,7 @@ def paused_s(recording: Recording) -> float:
     """Return the time that the slowest node of an episode lost in steps of two periods or more [s]."""
     lost_s = [0.0]
     for steps in recording.episode.steps.values():
-        # A step that is a little late is no pause: the node returns to its schedule.
+        # A slightly late step is no pause: the node returns to its schedule.
         gaps_s = np.diff(steps.begun_s)
         if gaps_s.size:
             period_s = float(np.median(gaps_s))
@@ -79,7 +79,7 @@ def paused_s(recording: Recording) -> float:
 
 
 def _recorded(recording: Recording, robot: Robot, use_truth: bool) -> States:
-    """Return the states of an episode on the robot: true states if they are used, else measured ones."""
+    """Return the states of an episode on the robot: true states if ``use_truth``, else measured ones."""
     outputs, truth = recording.episode.outputs, recording.true_states() if use_truth else None
     sent = as_sent(robot.drive.command, outputs[AGENT], outputs[ACTUATOR])
     if truth is not None:
@@ -104,7 +104,7 @@ def _simulated(
         parameters = [nominal] * len(recordings)
     else:
         return []
-    # An error must not lose the deployment.
+    # An error in the simulation must not lose the deployment.
     try:
         computation, hiccups = recordings[0].timing.computation(1.0 / robot.drive.rate_hz)
         rest = [_rest(robot, recording.episode) for recording in recordings]
@@ -129,7 +129,7 @@ def _rest(robot: Robot, episode: Episode) -> np.ndarray:
 def plausible_parameters(identification: Identification, episodes: int) -> list[dict[str, float]]:
     """Return the parameters of each simulation: the estimates for the first one of each episode, then posterior draws.
 
-    The delays are the estimates in all simulations, because the graph is made for these.
+    All simulations have the estimated delays, for which the graph is made.
     """
     from sim2real.training.environment.draws import draw_robots
     from sim2real.training.environment.variation import VariationConfig

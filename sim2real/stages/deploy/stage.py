@@ -44,15 +44,15 @@ def deploy(
         robot: The robot, or the name of its pipeline.
         bundle: The policy, or its folder.
         folder: Folder for the logs; a log is never overwritten.
-        config: Default: that of the robot. A dict holds the fields that differ from it. The
-            field ``bundle`` is ignored.
-        identification: Parameters of the simulation, or their folder; without them there is no gap report.
+        config: Settings; default: the robot's. A dict has the settings that differ from these. The field ``bundle`` is
+            ignored.
+        identification: Parameters of the simulation, or their folder; without them there is no comparison.
 
     Returns:
-        The episodes on the robot beside the same in simulation.
+        The episodes on the robot, with the same episodes in simulation.
 
     Raises:
-        Sim2RealError: The policy does not fit the robot, or the cause that stopped the robot.
+        Sim2RealError: The policy does not fit the robot, or the robot was stopped.
     """
     # Check all arguments before the robot moves.
     robot = robot_of(robot)
@@ -85,7 +85,7 @@ def _deployed(
     delay = run_episodes(robot, bundle, config, logs, following)
     recordings = tuple(Recording.load(log) for log in logs)
     if config.dry_run:
-        # The robot did not move: there are no scores and no gap.
+        # The robot did not move: there are no scores.
         return Deployment(tuple(EpisodeRow({}) for _ in recordings), dry_run=True, recordings=recordings)
 
     # Simulate the same. JAX programs are imported and compiled only now, when the robot is at rest.
@@ -101,12 +101,12 @@ def _deployed(
 
 
 def run(robot: RecordedRobot, config: DeployConfig, root: Path, run_dir: Path | None) -> StageFolder:
-    """Deploy the policy; write logs, scores and the gap to simulation into a stage folder. A dry run writes logs alone.
+    """Deploy the policy; write logs, scores and the comparison into a stage folder. A dry run writes only logs.
 
     Args:
-        run_dir: Run folder to add to; None takes that of the bundle.
+        run_dir: Run folder to add to; None: the bundle's.
     """
-    # Check the bundle before a folder is made. A policy that was trained here is deployed in its run.
+    # Check the bundle before a folder is made. A policy from a run is deployed in the same run.
     robot = _commanded(moving(robot), config)
     path = find_bundle(config.bundle or robot.name, root, run_dir)
     if path == shipped_policy(robot.folder):
@@ -153,12 +153,12 @@ def _commanded(robot: Robot, config: DeployConfig) -> Robot:
         if commanded is None:
             raise UsageError(f"pipeline {robot.name!r} follows no velocity", hint="run it without --command")
         robot = commanded(config.command)
-    robot.task.at_rest(0)  # a task that needs JAX is refused before the robot moves
+    robot.task.at_rest(0)  # raises an error before the robot moves if the task needs JAX
     return robot
 
 
 def _following(robot: Robot, identification: Identification) -> Following | None:
-    """Return how the robot follows its commands, by the identified model; None: the robot's computer has no model."""
+    """Return how the robot follows its commands, by the identified model; None if this computer lacks JAX."""
     following = robot.model.following(identification.values) if has_jax() else None
     delays = [p.estimate for p in identification.parameters if p.name == ROUND_TRIP]
     if following is None or following.push is None:
@@ -167,7 +167,7 @@ def _following(robot: Robot, identification: Identification) -> Following | None
 
 
 def _show(deployment: Deployment) -> None:
-    """Print the gap to simulation, the tests of the model and the verdict of a deployment."""
+    """Print the scores, the tests of the model and the verdict of a deployment."""
     tables = [deployment.rows(), compared_table(deployment.replay)]
     tables += [] if deployment.drift is None else [deployment.drift.rows()]
     for content in tables:
@@ -205,14 +205,14 @@ def require_fit(robot: Robot, bundle: Bundle, config: DeployConfig) -> None:
     if config.max_tilt_rad is not None and tilt_of(task.observation) is None:
         raise UsageError(
             "this robot does not measure its tilt",
-            hint=f"run without --max-tilt-rad, or show {GRAVITY!r} to the policy",
+            hint=f"run without --max-tilt-rad, or add the term {GRAVITY!r} to the observation",
         )
 
     def terms(of: PolicyContract | RobotTask) -> dict[str, object]:
         seen = [(t.name, tuple(t.units), t.history) for t in of.observation]
         return {"sees": seen, "sends": [(t.name, t.unit) for t in of.action]}
 
-    # A row for each difference: what the policy has, and what the robot has.
+    # For each difference: what the policy has, and what the robot has.
     rows: list[tuple[str, str]] = []
     for (verb, trained), here in zip(terms(contract).items(), terms(task).values(), strict=True):
         rows += [(f"{verb} {trained}", f"has {here}")] if trained != here else []

@@ -1,4 +1,4 @@
-"""The verdict on a deployment, by a table of rules; and the command that follows from it."""
+"""The verdict on a deployment, by a table of rules, and the next command."""
 
 from __future__ import annotations
 
@@ -24,16 +24,17 @@ from sim2real.stages.terminal.console import progress
 from sim2real.stages.terminal.interruption import patiently
 
 _FAULTY_RATIO = 1.6
-"""Ratio of the error to the expected one, with the parameters fitted to the deployment, above which a joint moves as no
-parameters explain."""
+"""No parameters explain a joint's motion if the error, with parameters fitted to the deployment, is more than this many
+times the expected error.
+"""
 _MAX_UNEXPLAINED = 0.5
-"""Largest share of the error that may remain after a fit to the log; above it no parameters explain the motion."""
+"""Nor do parameters explain the motion if a fit to the log leaves more than this share of the error."""
 _MAX_LATE_SHARE = 0.01
 """Largest share of steps that may take longer than the longest step of training."""
 _MAX_PAUSES_S = 0.1
-"""Longest time that an episode may lose in pauses; a policy that then fails is not judged."""
+"""Longest time that an episode may lose in pauses [s]: beyond it, a policy that fails is not judged."""
 _ENOUGH_S = 12.0
-"""Length of a deployment's logs that suffices to identify from [s]."""
+"""Shortest length of a deployment's logs from which to identify [s]."""
 
 
 def judge(
@@ -44,7 +45,7 @@ def judge(
     Args:
         robot: In the world of the identification.
         identification: The model; None: it is not tested.
-        folder: Folder of the deployment, for the next command.
+        folder: Folder of the deployment, which the next command names.
     """
     deployment = _tested(deployment, robot, identification)
     verdict = decide(deployment)
@@ -87,13 +88,13 @@ def decide(deployment: Deployment) -> Verdict:
 
 
 def _no_comparison(d: Deployment) -> list[Reason]:
-    """Neither a model nor a simulation."""
+    """There is neither a model to test nor a simulation."""
     nothing = d.untested == Reason(Finding.NO_MODEL) and not any(e.simulation for e in d.episodes)
     return [Reason(Finding.NO_MODEL)] if nothing else []
 
 
 def _unexplained(d: Deployment) -> list[Reason]:
-    """Motion that no parameters explain, also those fitted to these logs: another identification would not help."""
+    """No parameters explain the motion, not even those fitted to these logs: identifying again would not help."""
     fitted = {r.joint: _ratio(as_here(r)) for r in d.replay}
     left = {r.joint: fitted[r.joint] / max(_ratio(r), 1e-9) for r in d.replay}
     faulty = [name for name in fitted if fitted[name] > _FAULTY_RATIO and not left[name] <= _MAX_UNEXPLAINED]
@@ -101,18 +102,18 @@ def _unexplained(d: Deployment) -> list[Reason]:
 
 
 def _harmless(d: Deployment) -> list[Reason]:
-    """A changed parameter, while all predictions are within their expected errors and the policy succeeds."""
+    """A parameter changed, but all predictions are within their expected errors and the policy succeeds."""
     holds = all(r.ratio is not None and r.ratio <= 1.0 for r in d.replay)
     return [Reason(Finding.SUCCESS), *_changed(d)] if holds and _changed(d) and not _failed(d) else []
 
 
 def _changed(d: Deployment) -> list[Reason]:
-    """A parameter that the drift test names."""
+    """The drift test found a changed parameter."""
     return [Reason(Finding.CHANGED, d.drift.named.name)] if d.drift and d.drift.named else []
 
 
 def _wrong(d: Deployment) -> list[Reason]:
-    """Errors above the expected ones, the worst joint first."""
+    """Errors are above the expected ones; the worst joint comes first."""
     exceeded = sorted((r for r in d.replay if r.exceeded), key=_ratio, reverse=True)
     wrong = [Reason(Finding.WRONG, r.joint) for r in exceeded]
     likely = [Reason(Finding.LIKELY, d.drift.likely.name)] if d.drift and d.drift.likely else []
@@ -120,18 +121,18 @@ def _wrong(d: Deployment) -> list[Reason]:
 
 
 def _paused(d: Deployment) -> list[Reason]:
-    """A policy that fails in an episode with pauses, which no simulation has."""
+    """The policy failed in an episode with pauses, which simulations do not have."""
     lost = max(e.paused_s for e in d.episodes) > _MAX_PAUSES_S
     return [Reason(Finding.PAUSED), *_failed(d)] if lost and _failed(d) else []
 
 
 def _failed_late(d: Deployment) -> list[Reason]:
-    """A policy that fails while steps take longer than in training: it needs their timing, from a newer log."""
+    """The policy failed while steps took longer than in training: train with the timing of a newer log."""
     return _failed(d) if _late(d) else []
 
 
 def _failed(d: Deployment) -> list[Reason]:
-    """A policy that does not succeed often enough. Where nothing measures success, late steps are all that is known."""
+    """The policy failed too often; if the task has no success, late steps count instead."""
     success = d.score("success").real
     if success is None:
         return [*_late(d), _model(d)] if _late(d) else []
@@ -139,12 +140,12 @@ def _failed(d: Deployment) -> list[Reason]:
 
 
 def _not_tested(d: Deployment) -> list[Reason]:
-    """A model whose test failed, so that success may be luck."""
+    """The model could not be tested, so that success may be luck."""
     return [d.untested] if d.untested is not None and d.untested.finding is Finding.UNTESTED else []
 
 
 def _good(d: Deployment) -> list[Reason]:
-    """Nothing of the above."""
+    """No other rule applies."""
     return [Reason(Finding.SUCCESS), _model(d), *_late(d)]
 
 
@@ -207,7 +208,7 @@ def next_command(
         return " && ".join(then)
     usual = replace(default, terms=verdict.terms)
     logs = logs_to_identify([r.path for r in deployment.logs], deployment.drift, identification, folder)
-    # Without logs that suffice the robot is recorded first.
+    # If the logs do not suffice, record the robot first.
     if "record" in stages or not logs:
         record = shlex.join(["sim2real", "record", robot.name])
         identify = shlex.join(["sim2real", "identify", robot.name, "--terms", verdict.terms])
@@ -238,7 +239,7 @@ def terms_to_identify(
 def logs_to_identify(
     deployed: Sequence[Path], drift: Drift | None, identification: Identification, folder: Path
 ) -> tuple[str, ...]:
-    """Return the logs to identify from: the deployment's, and those of the identification if the robot has not changed.
+    """Return the logs to identify from: the deployment's, and the earlier logs if the robot has not changed.
 
     Args:
         deployed: Logs of the deployment.

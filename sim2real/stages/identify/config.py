@@ -22,31 +22,32 @@ class IdentifyConfig(FitConfig):
     standing: Annotated[str | None, Flag("FILE")] = None
     """Log of a robot on its feet (`record --excitation standing`), from which its load is estimated."""
     settle_s: float = 0.3
-    """First part of a held-out segment, to which its initial state is fitted; the rest is predicted [s]."""
+    """Length of the first part of a held-out segment, to which its initial state is fitted [s]."""
     horizon_s: float = 1.0
-    """Rest of a segment: the horizon of its prediction [s]."""
+    """Horizon of predictions: length of a held-out segment after its first part [s]."""
     spacing_s: float = 0.0
     """Distance between the starts of fitted segments [s]; 0 puts them side by side."""
     after_s: float = 0.0
-    """First part of each log that is not used, such as the way of hanging legs to their excitation [s]."""
+    """Length of the first part of each log that is not used, such as the way to the start of the excitation [s]."""
     held_out: float = 0.25
     """Share of each log, at its end, that is held out; 0 if whole logs are held out."""
     free_run_s: float = 10.0
-    """Longest simulation of a held-out part from a single initial state [s]."""
+    """Longest free run: a prediction of a held-out part from one initial state [s]."""
     folds: int = 5
-    """Parts that are held out of a refit, one at a time, to measure errors on new data: each of several logs, or this
-    many blocks of a single log; 0 skips the refits."""
+    """Number of parts that are held out of a refit, one at a time, to measure errors on new data: each log is a part, a
+    single log is cut into this many; 0 skips the refits.
+    """
     terms: str = "own"
     """Optional terms: 'own' (the pipeline's, and one that halves the errors on held-out parts), 'auto' (chosen on
     held-out parts), 'all', 'none', or names separated by commas."""
     bounds: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Bounds of a parameter that replace the pipeline's: one flag a parameter."""
+    """Bounds of a parameter instead of the pipeline's; repeat the flag for each parameter."""
     fix: dict[str, float] = field(default_factory=dict)
-    """Value at which a parameter is held: one flag a parameter."""
+    """Value at which a parameter is fixed; repeat the flag for each parameter."""
     world: str | None = None
     """World of an installed package in which to identify; default: the robot's."""
     links: bool = False
-    """Identify the distribution of the measurements' delays, their losses and the drift of their clock, too."""
+    """Also estimate the distribution of the measurements' delay, and the share of lost messages."""
 
     def __post_init__(self) -> None:
         """Check the values before a log is read."""
@@ -55,7 +56,7 @@ class IdentifyConfig(FitConfig):
             raise UsageError(f"held_out must lie in [0, 0.8], got {self.held_out}")
         if self.held_out == 0.0 and not self.hold_out:
             raise UsageError(
-                "held_out is 0 and no log is held out: a held-out part must check an identification",
+                "held_out is 0 and no log is held out: an identification must be checked on a held-out part",
                 hint="set --held-out to a share of the log, or name a log with --hold-out",
             )
         if not (0.0 <= self.settle_s <= 10.0 and 0.2 <= self.horizon_s <= 600.0):

@@ -25,13 +25,13 @@ from sim2real.stages.terminal.interruption import patiently
 _PERCENT_OF_SEARCH, _PERCENT_OF_REFINEMENT = 70, 30
 """Shares of a progress bar."""
 _AS_GOOD = 1e-3
-"""Relative excess of the loss up to which a fit with a held parameter is as good."""
+"""A fit with a fixed parameter is as good if its loss is larger by at most this share."""
 _LEAST_SEGMENTS = 4
-"""Fewest segments from which parts are held out."""
+"""Fewest segments with which parts are held out."""
 _LEAST_TO_CHOOSE = 3
-"""Fewest parts for a selection of terms: one is held out, and the others predict each other."""
+"""Fewest parts with which terms are selected."""
 _FAR = 2.0
-"""Ratio of residuals to noise above which a term may be missing."""
+"""A term may be missing if the residuals are above this many times the noise."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +40,9 @@ class Fits:
 
     Attributes:
         inputs: The data, and the model with the terms of the estimate.
-        parts: Errors without each part of the recordings, where the selection of terms has them.
-        tried: The optional terms beside the model's own ones, with their gains; empty if none was tried.
-        added: The optional term that was added, as it halves the errors; "": none.
+        parts: Errors on each held-out part, if the selection of terms computed them.
+        tried: The optional terms that were tried in addition to the model's, with their gains.
+        added: The optional term that was added because it halves the errors; "": none.
     """
 
     inputs: Inputs
@@ -63,15 +63,15 @@ class Fits:
 def fit_model(inputs: Inputs, best: Best) -> Fits:
     """Fit the model, and select its optional terms.
 
-    With ``auto`` they are selected among all, beginning with none; otherwise terms are compared beside the model's own
-    where residuals are far above the noise, and one that halves the errors is added if the terms are ``own``.
+    With ``auto``, terms are selected among all, beginning with none. Otherwise, if residuals are far above the noise,
+    further terms are tried, and with ``own`` a term that halves the errors is added.
 
     Args:
         best: Updated with the best values so far.
     """
     config, auto = inputs.config, inputs.config.terms == "auto"
     base = with_terms(inputs, "none") if auto else inputs
-    # Terms are compared on windows, which takes less time; long segments follow.
+    # Compare terms on windows, which takes less time; long segments follow.
     longer = bool(_long_spans(inputs))
     windows = replace(base, config=replace(config, long_s=0.0)) if longer else base
     whole = _fitted(windows, best, "identify")
@@ -90,7 +90,7 @@ def fit_model(inputs: Inputs, best: Best) -> Fits:
         parts = tuple(selection.chosen.rows) if auto else None
     if base is inputs and not longer:
         return Fits(inputs, whole, tried=tried)
-    # Refine the model with the selected terms; the parameters of all other terms have their values without the term.
+    # Refine the model with the selected terms; parameters of all other terms have their values without effect.
     title = f"identify with {', '.join(base.table.terms) or 'no term'}" if tried else "identify"
     estimate = _fitted(base, best, title, end=base.table.encode(values))
     return Fits(base, estimate, parts, tried, added)
@@ -120,7 +120,7 @@ def _long_spans(inputs: Inputs) -> list[Span]:
 
 
 def _compared(inputs: Inputs, own: Fit, on_set: Callable[[str], None]) -> tuple[ParameterTable, Selection] | None:
-    """Return the table of all terms, and the sets of them that were compared; None if there is no need, or no term."""
+    """Return the table of all terms, and the compared sets of terms; None if there is no need, or no term."""
     terms, auto = own.problem.table.terms, inputs.config.terms == "auto"
     if not auto and (not has_parts(inputs, own) or above_noise(own.problem.linearise(own.x)) < _FAR):
         return None
@@ -138,7 +138,7 @@ def compare_terms(
     names: Sequence[str],
     on_set: Callable[[str], None] = lambda names: None,
 ) -> Selection:
-    """Return the terms without which held-out parts are predicted worse, or further ones beside those of a fit.
+    """Return the terms that improve the prediction of held-out parts, or one term to add to a fit.
 
     Args:
         problem: The same segments for the model with all optional terms.
@@ -157,22 +157,22 @@ def compare_terms(
 
 
 def has_parts(inputs: Inputs, fitted: Fit) -> bool:
-    """Return whether parts of the recordings are held out, on which terms are compared."""
+    """Return whether parts of the recordings are held out, so that terms can be compared."""
     return bool(fitted.converged and inputs.config.folds and len(fitted.problem.train) >= _LEAST_SEGMENTS)
 
 
 def determined(fits: Fits, check: Determined, spread: Uncertainty) -> tuple[Fits, list[str]]:
-    """Hold parameters that the data does not determine at their nominal values, as long as the fit stays as good.
+    """Fix parameters that the data does not determine at their nominal values, as long as the fit stays as good.
 
     Returns:
-        The fits, and a sentence for each held parameter.
+        The fits, and a sentence for each fixed parameter.
     """
     inputs, estimate, groups, sentences = fits.inputs, fits.estimate, check.undetermined, list[str]()
     table, tried = estimate.problem.table, set[str]()
     absent = [n for n, verdict in zip(table.names, spread.state, strict=True) if verdict in (ABSENT, NOT_REACHED)]
     able = {p.name for p in table if p.kind == "dynamics" and not p.term}
     while names := [n for group in groups for n in group if n in able - tried]:
-        # Begin with parameters that a model may be without, such as an inertia of the rotor.
+        # Begin with parameters that a model may lack, such as an inertia of the rotor.
         name = min(names, key=lambda n: not table[n].vanishes)
         tried.add(name)
         held = estimate.problem.table.with_fixed({name: table[name].nominal})
@@ -195,7 +195,7 @@ def determined(fits: Fits, check: Determined, spread: Uncertainty) -> tuple[Fits
 def without_parts(fits: Fits) -> tuple[HeldOutPart, ...]:
     """Return the estimates without each part of the recordings, and their errors on that part.
 
-    There are none without a converged fit, whose errors would bound no later error.
+    Without a converged fit there are none: its errors would tell nothing about later ones.
     """
     inputs, estimate = fits.inputs, fits.estimate
     config = inputs.config

@@ -39,7 +39,7 @@ class Inputs:
         loaded: The robot as its pipeline makes it, in its own world and with its own terms.
         robot: The robot in the configured world, with the optional terms that the configuration names.
         table: The parameters, with the bounds and fixed values of the configuration.
-        logs: The fitted recordings, then those that are held out whole.
+        logs: The fitted recordings, then the recordings that are held out as a whole.
         hashes: SHA-256 of each log's file before the fit; "" for a recording without a file.
         windows: Segments of one length: those to fit, and the held-out ones, which are predicted.
         standing: The recording of a robot on its feet; None: there is none.
@@ -66,14 +66,14 @@ class Inputs:
         """Return the logs with their hashes from before the fit.
 
         Args:
-            run_dir: Folder that paths are relative to; None: names alone.
+            run_dir: Folder to which paths are relative; None: only names.
         """
         paths = [log.path.name if run_dir is None else portable(log.path, run_dir) for log in self.logs]
         return tuple(Source(*pair) for pair in zip(paths, self.hashes, strict=True))
 
     @property
     def episodes(self) -> list[Episode]:
-        """One episode a recording."""
+        """The episode of each recording."""
         return [log.episode for log in self.logs]
 
     @property
@@ -102,8 +102,8 @@ def prepare(
         standing: The recording of a robot on its feet.
 
     Raises:
-        UsageError: When the recordings are too short, one is given twice, or the configuration does not fit the model.
-        Sim2RealError: When a recording is in other units than the robot.
+        UsageError: The recordings are too short, one is given twice, or the configuration does not fit the model.
+        Sim2RealError: A recording has other units than the robot.
     """
     loaded, robot = robot, configured(robot, config)
     logs = (*fitted, *held_out)
@@ -130,7 +130,7 @@ def with_load(
 
     A load outside of its bounds is a warning: the rest is identified.
     """
-    from sim2real.robots.walking import weighing  # the modules of walking robots alone
+    from sim2real.robots.walking import weighing  # imported late: only walking robots need it
 
     try:
         return weighing.weighed(robot, document, log.episode, truth)
@@ -148,8 +148,8 @@ def with_terms(inputs: Inputs, wanted: str, selected: str = "", bounds: Bounds |
     """Return the inputs of the robot with optional terms; the settings stay.
 
     Args:
-        wanted: The terms that the robot offers, as in ``offering``.
-        selected: Those among them that are identified; default: the wanted ones.
+        wanted: The terms that the robot's model gets.
+        selected: The terms that are identified; default: ``wanted``.
         bounds: Further bounds.
     """
     robot = configured(inputs.loaded, replace(inputs.config, terms=wanted))
@@ -163,13 +163,13 @@ def table_of(model: IdentifiableModel, config: IdentifyConfig, episodes: Sequenc
     """Return the model's parameters with the configured terms, bounds and fixed values.
 
     Args:
-        episodes: The fitted recordings: bounds of limits among the terms follow from what they reach.
+        episodes: The fitted recordings: the bounds of limits follow from what they reach.
     """
     bounded = model.parameters.with_bounds(config.bounds)
     if isinstance(model, HasLimits) and config.terms not in ("own", "none"):
         bounded = bounded.with_reached(model.reached(episodes))
     table = with_wanted_terms(bounded, config.terms).with_fixed(config.fix)
-    # A data sheet's delay of one side fixes how the delay is shared: then the other side's is identified.
+    # If the data sheet has one of the two delays, it is fixed, and the other delay is identified.
     for p in table:
         held = p.kind == "delay" and p.side == "measurement" and not p.free and p.name not in config.fix
         if held and any(q.name in config.fix for q in table if q.kind == "delay" and q.side == "command"):

@@ -45,11 +45,11 @@ from sim2real.stages.terminal.console import progress
 from sim2real.stages.terminal.interruption import patiently
 
 _NO_DELAY_S = 1e-4
-"""Estimates of delays below this count as no delay [s]."""
+"""Estimated delays below this count as no delay [s]."""
 _HORIZONS = (0.1, 1.0)
 """Shares of the horizon up to which errors are stored; a deployment is compared at the shorter one."""
 _MOST = 3
-"""Most errors above the expected ones that are named."""
+"""Number of errors above the expected ones that are named."""
 
 
 def judge(fits: Fits) -> Identification:
@@ -58,10 +58,10 @@ def judge(fits: Fits) -> Identification:
     with progress(None, "identify: held-out parts") as bar:
         # Refit without each part of the recordings.
         parts = patiently(lambda: without_parts(fits))
-        # Compute intervals; they widen where estimates without one part differ.
+        # Compute intervals; they widen if the estimates without one part differ.
         bar.set_description_str("identify: intervals")
         findings, held = patiently(lambda: Findings.of(fits.estimate, parts)), list[str]()
-        # A choice of the model includes which parameters it has: hold those that the data does not determine.
+        # Fix the parameters that the data does not determine.
         if (config.terms == "auto" or fits.added) and fits.estimate.converged and findings.check.undetermined:
             fits, held = patiently(lambda f=findings: determined(fits, f.check, f.spread))
             findings = patiently(lambda: Findings.of(fits.estimate, parts)) if held else findings
@@ -69,7 +69,7 @@ def judge(fits: Fits) -> Identification:
         truth = true_values(inputs.logs[0])
         posterior = fit.problem.table.posterior(fit.x, findings.spread.scale_covariance, findings.widening)
         document = _estimates(inputs.loaded.name, findings, posterior, truth)
-        # Predict held-out parts, beside baselines.
+        # Predict held-out parts, by the model and by baselines.
         bar.set_description_str("identify: predictions and baselines")
         document = patiently(lambda: _predicted(document, inputs, fit))
         bar.set_description_str("identify: each log, distribution of delays")
@@ -82,7 +82,7 @@ def judge(fits: Fits) -> Identification:
     if inputs.standing is not None:
         document = with_load(document, inputs.robot, inputs.standing, truth)
     names = [n for n in inputs.undetermined if n not in document.values]
-    # The robot's own bounds may be widened once.
+    # The verdict proposes to widen only bounds of the robot, not bounds that the user has set.
     usual = defaults_of(inputs.loaded).identify.bounds
     set_by_user = {n for n, both in config.bounds.items() if usual.get(n) != both}
     open_ = [f"not determined by this log: {', '.join(names)}"] if names else []
@@ -100,7 +100,7 @@ class Findings:
     Attributes:
         at: The residuals at the estimate.
         check: The combinations of parameters that the data determines.
-        widening: Factor on deviations with which draws cover the errors of the model.
+        widening: Factor on standard deviations, so that draws cover the errors of the model.
     """
 
     fit: Fit
@@ -119,14 +119,14 @@ class Findings:
         """Compute the uncertainty of a fit.
 
         Args:
-            without: The estimates without one part of the recordings each.
+            without: The fits without one part of the recordings each.
         """
         at = fit.problem.linearise(fit.x)
         spread = widened(from_linearised(fit.problem, at), fit.problem.table, at, without)
         table = fit.problem.table
         one_sided = [n for n, v in zip(table.names, spread.state, strict=True) if v in (ABSENT, NOT_REACHED)]
         check = what_is_determined(fit.problem, at, one_sided)
-        # The loss does not depend on a limit that no motion reaches: it stays nominal.
+        # The loss does not depend on a limit that no motion reaches: such a limit stays nominal.
         x = np.where([v == NOT_REACHED for v in spread.state], np.maximum(table.nominal(), at.x), at.x)
         return Findings(replace(fit, x=x), replace(at, x=x), spread, check, posterior_widening(at, spread))
 
@@ -138,7 +138,7 @@ def _estimates(pipeline: str, findings: Findings, posterior: Posterior, truth: M
         truth: Known parameters of the embedded robot.
     """
     fit = findings.fit
-    # Away from a minimum no interval means anything.
+    # Away from a minimum, intervals have no meaning.
     spread = findings.spread if fit.converged else None
     rows = verdict.estimates(fit.problem.table, fit.values, spread, truth)
     document = Identification(pipeline, (), Judgement("", ()), rows)
@@ -146,7 +146,7 @@ def _estimates(pipeline: str, findings: Findings, posterior: Posterior, truth: M
 
 
 def _doubted(row: Estimate) -> Estimate:
-    """Return the row of a parameter of a fit that is not accepted, in which none is ok."""
+    """Return a parameter's row for a fit that is not accepted: its state is never ``ok``."""
     return replace(row, state="not determined") if row.state == "ok" else row
 
 
@@ -174,7 +174,7 @@ def _predicted(document: Identification, inputs: Inputs, fit: Fit) -> Identifica
 
 
 def _without_delays(fit: Fit) -> dict[str, Mapping[str, float]]:
-    """Return the baseline: the same model fitted without delays, if it has some."""
+    """Return a baseline: the same model fitted without delays, if it has delays."""
     table = fit.problem.table
     kept = np.array([c.kind != "delay" for c in table.columns])
     if kept.all():
@@ -197,13 +197,13 @@ def free_runs(
     """Simulate the held-out part of each log in one run; return its columns, and its commands and starts.
 
     Args:
-        fitted: Number of fitted logs; the later ones are held out whole.
+        fitted: Number of fitted logs; the later logs are held out as a whole.
         models: Model -> values of all parameters.
     """
     splits = [split_of(episode, r < fitted, config) for r, episode in enumerate(episodes)]
     ends = [usable(episode, config)[1] for episode in episodes]
     least_s = config.settle_s + config.horizon_s
-    # Take the held-out part of each log that is long enough, each to its own end.
+    # Take the held-out part of each log that is long enough.
     held_out = [Span(r, split, False) for r, split in enumerate(splits) if ends[r] - split > least_s]
     if not held_out or not config.free_run_s:
         return {}, {}
@@ -214,7 +214,7 @@ def free_runs(
 
 
 def _compared(document: Identification, inputs: Inputs, fit: Fit, parts: Sequence[HeldOutPart]) -> Identification:
-    """Return the document with expected errors, and ranges of the fitted motion."""
+    """Return the document with expected errors and the extent of the fitted motion."""
     names, measured = [log.path.name for log in inputs.logs], positions(inputs.model, inputs.units)
     fitted = [s for s in inputs.windows if s.fitted]
     held_out = [[s for s in inputs.windows if s.recording == r and not s.fitted] for r in range(len(inputs.logs))]
@@ -260,7 +260,7 @@ def _judged(
     """Return the document with its verdict, whose ``next`` are flags with which to identify again.
 
     Args:
-        doubts: Sentences about parameters that are held, and terms.
+        doubts: Sentences about fixed parameters and terms.
         set_by_user: Parameters whose bounds the user has set.
     """
     fit = findings.fit

@@ -1,7 +1,6 @@
-"""The course of a fit: its best values so far, and the file that keeps them.
+"""The best values of a running fit, and the file that keeps them.
 
-``partial.json`` has the fitted values while they are judged; it stays if a signal or an error ends the stage before the
-verdict.
+``partial.json`` has the fitted values until the verdict; it stays if a signal or an error ends the stage before.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ class Best:
     """The best values of a fit so far.
 
     Attributes:
-        folder: Folder of the stage, in which they are written; None: they are not.
+        folder: Folder of the stage, into which the values are written; None: they are not written.
         inputs: The data of the identification.
         again: The command that continues from ``partial.json``.
         table: The parameters of the search.
@@ -56,7 +55,7 @@ class Best:
         self.table, self.z, self.loss, self.done = table, None, np.inf, {"search": 0.0, "refine": 0.0}
 
     def advance(self, stage: str, share: float, loss: float, z: np.ndarray) -> None:
-        """Record progress; the first result of a refinement replaces that of the search, even with a larger loss.
+        """Record progress; the first result of a refinement replaces the search's result, even if its loss is larger.
 
         Args:
             stage: ``search`` or ``refine``.
@@ -73,7 +72,7 @@ class Best:
         self.done[stage] = min(1.0, self.done[stage] + share)
 
     def fitted(self, z: np.ndarray, loss: float) -> None:
-        """Record the finished fit, which is written before the longer judgement begins.
+        """Record the finished fit, and write it before the judgement, which takes longer.
 
         Args:
             z: Shape ``(P,)``: the estimate.
@@ -99,10 +98,11 @@ class Best:
 def kept(stage: OpenStage, inputs: Inputs, again: str) -> Iterator[Best]:
     """Yield the record of the best values, with its file in the stage's folder.
 
-    ``partial.json`` is an output of the stage if a signal ends it, or an error after the fit. A judgement removes it.
+    ``partial.json`` becomes an output of the stage if a signal ends the stage, or an error after the fit; the verdict
+    removes it.
 
     Args:
-        again: The command that continues from it.
+        again: The command that continues from ``partial.json``.
     """
     best, path = Best(stage.folder, inputs, again), stage.folder / PARTIAL
     try:

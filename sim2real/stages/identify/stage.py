@@ -35,7 +35,7 @@ from sim2real.stages.shared.identification import command, continuing, identifie
 from sim2real.stages.terminal.console import artifact_table, note, progress
 
 _MOST_ROWS = 12
-"""Rows of a table of errors on the console; 120 logs have 480."""
+"""Most rows of a table of errors on the console: 120 logs would have 480."""
 
 
 def identify(
@@ -52,8 +52,8 @@ def identify(
     Args:
         robot: The robot, or the name of its pipeline.
         recording: The recordings to fit: one or several, or the paths of their logs.
-        config: Settings; default: the robot's. A dict has the settings that differ from these. The
-            files that it may name are not read.
+        config: Settings; default: the robot's. A dict has the settings that differ from these. Files in the settings
+            are not read.
         hold_out: Recordings that are only predicted.
         best: Updated with the best values so far while the search runs.
         begin: Values at which the search begins; default: the model's.
@@ -63,8 +63,8 @@ def identify(
         Estimates, their uncertainty, their predictions, and a verdict.
 
     Raises:
-        UsageError: When the recordings are too short, or the model does not fit them.
-        Sim2RealError: When a recording holds no numbers where the model reads some, or other units.
+        UsageError: The recordings are too short, or do not fit the model.
+        Sim2RealError: A recording has NaN in a field of the model, or other units.
     """
     robot = robot_of(robot)
     config = config_of(config, defaults_of(robot).identify)
@@ -75,7 +75,7 @@ def identify(
 
 
 def _identify(inputs: Inputs, best: Best) -> Identification:
-    # Fit, then write the fit down before it is judged, which takes longer than the fit.
+    # Fit, and store the fit before it is judged, which takes longer.
     fits = fit_model(inputs, best)
     best.fitted(fits.estimate.x, fits.estimate.loss)
     identification = judge(fits)
@@ -92,7 +92,7 @@ def run(robot: RecordedRobot, config: IdentifyConfig, root: Path, run_dir: Path 
     """Identify the robot's parameters, in a stage folder.
 
     Args:
-        run_dir: Run folder to add to; None takes the one of the log.
+        run_dir: Run folder to add to; None: the log's.
     """
     paths, run_dir = find_logs(robot, config, root, run_dir)
     # Refuse wrong flags, logs that are given twice and logs that are too short before a folder is made.
@@ -132,7 +132,7 @@ def _write(identification: Identification, stage: OpenStage, robot: RecordedRobo
 
 
 def show(identification: Identification) -> None:
-    """Print the verdict: may I use it, why, how far off will it be, what do I do next. Then print the details."""
+    """Print the verdict (whether to use the estimates, reasons, expected error, next command), then details."""
     verdict = identification.verdict
     note(f"verdict: {identification.headline}")
     for reason in verdict.reasons[:1]:
@@ -173,7 +173,7 @@ def summary(identification: Identification) -> dict[str, str]:
 
 
 def _following(robot: RecordedRobot, stage: OpenStage, identification: Identification) -> str:
-    """Return what to do where no flags of identify follow from the verdict."""
+    """Return what to do if no flags of `identify` follow from the verdict."""
     name, folder, status = robot.name, shlex.quote(shown(stage.folder)), identification.verdict.status
     advice = advised(identification.verdict.reasons)
     first = f"{advice}, or " if advice else ""
@@ -203,7 +203,7 @@ def find_logs(
     """Return the logs, held-out ones at the end, and the run folder.
 
     Args:
-        config: Names logs, or none: then the newest finished recording is taken.
+        config: Has the logs; without logs, the newest finished recording is taken.
         run_dir: Run folder that is searched first.
     """
     held_out = [Path(p) for p in config.hold_out]

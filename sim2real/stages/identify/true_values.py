@@ -1,4 +1,4 @@
-"""True parameters and delays of the embedded robot, read after the fit for comparison."""
+"""True parameters and delays of the embedded robot, which are read after the fit, for comparison."""
 
 import math
 
@@ -13,7 +13,7 @@ from sim2real.stages.terminal.console import note
 _NEAR_NS = 3_000_000
 """Largest distance between a sample of the robot and a step of the sensor that read it [ns]."""
 _SAME_NS = 50_000
-"""How far behind its stamp a step may have read a sample: in virtual time the stamp is a tick before it [ns]."""
+"""A step may read a sample up to this long after its stamp: in virtual time, the stamp is a tick earlier [ns]."""
 
 
 def true_values(recording: Recording) -> dict[str, float]:
@@ -27,7 +27,7 @@ def true_values(recording: Recording) -> dict[str, float]:
         if truth is None:
             return {}
         values = {name: float(v) for name, v in truth.parameters.items()}
-    except (ValueError, KeyError) as error:  # the true values fill one column of a table
+    except (ValueError, KeyError) as error:  # without true values only a column of a table is empty
         note(f"warning: {recording.truth_path} is damaged, so estimates are not compared with it: {error}")
         return {}
     episode, origin_ns = recording.episode, recording.summary.get("monotonic_ns")
@@ -49,7 +49,7 @@ def sensing_delay_s(truth: Truth, steps: Steps, origin_ns: int) -> float:
     samples = truth.of(Kind.SAMPLE)
     if not len(samples):
         return float("nan")
-    # A bus gets a request near its stamp; a robot that publishes its state, which has no servos, sent it before.
+    # A bus gets the request near the stamp; a robot that publishes its state (without servos) sent it earlier.
     publishes = not truth.header.get("servo_ids", True)
     later = np.searchsorted(samples["t_host_ns"], stamp + _SAME_NS * publishes, side="right")
     earlier, later = np.maximum(later - 1, 0), np.minimum(later, len(samples) - 1)

@@ -1,4 +1,4 @@
-"""How files of other recorders become logs; every field is a flag. Imports no JAX, so that ``--help`` stays instant."""
+"""Flags of import. Imports no JAX, so that ``--help`` stays instant."""
 
 import re
 from dataclasses import dataclass
@@ -16,23 +16,24 @@ class ImportConfig:
     files: Annotated[tuple[Path, ...], Flag("FILE...", positional=True, needed=True)] = ()
     """Files of other recorders: npz, JSON, CSV, MCAP or the folder of a ROS 2 bag, or a LeRobot data set."""
     mapping: Path | None = None
-    """TOML file that maps signals to fields; default: the pipeline's import.toml, or one is proposed."""
+    """TOML file that maps signals to fields; default: the pipeline's import.toml; without one, a mapping is proposed.
+    """
     pipeline: Annotated[str | None, Flag(also="--like")] = None
-    """Pipeline whose robot was recorded: its joints, and the pipeline of the logs; default: the mapping's, or the
-    model's name."""
+    """Pipeline of the recorded robot, which has its joints; default: the mapping's pipeline, or the model's name."""
     mjcf: Path | None = None
     """Model of the robot (MJCF or URDF), for the names and ranges of its joints."""
     joints: tuple[str, ...] = ()
     """Joints that were recorded, by their names in the file, or in the order of columns without names."""
     unit: str | None = None
-    """Unit of positions and goals in the file, where their names have none: rad, deg, rev, mrad, m, mm, counts:N (N a
-    turn), or hundredths of LeRobot's calibrated ranges."""
+    """Unit of positions and goals in the file, if their names have no unit: rad, deg, rev, mrad, m, mm, counts:N (N per
+    turn), or hundredths of LeRobot's calibrated ranges.
+    """
     calibration: Path | None = None
-    """LeRobot's calibration of the arm, as lerobot-calibrate writes it."""
+    """LeRobot's calibration of the arm, written by lerobot-calibrate."""
     rate_hz: float | None = None
-    """Samples per second, where a file has no time stamps [Hz]."""
+    """Samples per second, if a file has no time stamps [Hz]."""
     together: bool = False
-    """All files are of one recording: a log of all of them instead of one for each."""
+    """All files belong to one recording: write one log of all files instead of one for each."""
     as_told: bool = False
     """Keep order, signs and units of the file or the mapping, even if the data contradict them or fit others."""
     episode: int | None = None
@@ -40,7 +41,7 @@ class ImportConfig:
     samples: Annotated[str | None, Flag("A:B")] = None
     """Take the samples from A to just before B, counted from 0; default: all."""
     out: Path | None = None
-    """Log to write; default: one in a run folder of its own, as record makes it."""
+    """Log to write; default: a log in a new run folder, as record makes it."""
     runs: Path = Path("runs")
     """Folder of all runs."""
 

@@ -26,13 +26,13 @@ from sim2real.stages.terminal.console import note, pairs, progress, wrote
 
 
 def run(config: ImportConfig) -> None:
-    """Write a log for each file, into a run folder of its own, or to the configured file.
+    """Write a log for each file, into a new run folder or to the configured file.
 
     The episodes of a LeRobot data set become the logs of one run.
 
     Raises:
-        UsageError: When a file or the mapping cannot be read, they do not fit each other, or the proposed mapping has
-            open questions.
+        UsageError: A file or the mapping cannot be read, they do not fit each other, or the proposed mapping has open
+            questions.
     """
     with _busy("read"):
         sets = [_long_enough(open_tables(path, config.episode)) for path in config.files]
@@ -43,7 +43,7 @@ def run(config: ImportConfig) -> None:
     mapping, joints = configured_mapping(config), config.joints
     text = "" if mapping else None
     for tables in sets:
-        # Read the file by the mapping; propose a mapping for the first file if there is none.
+        # Convert the files by the mapping; if there is none, propose one for the first file.
         if mapping is None:
             hints = hints_of(config)
             part = tables[0] if config.selection is None else tables[0].cut(config.selection)
@@ -99,12 +99,12 @@ def _long_enough(tables: list[Table]) -> list[Table]:
 
 
 def _busy(what: str) -> AbstractContextManager[Any]:
-    """Show on a terminal that time passes; a log file gets no lines of it."""
+    """Show on a terminal that time passes; print nothing into a file."""
     return progress(None, f"import: {what}", sys.stderr.isatty())
 
 
 def configured_mapping(config: ImportConfig) -> ImportMapping | None:
-    """Return the mapping of the flag or of the pipeline; None: one is proposed."""
+    """Return the mapping of the flag or of the pipeline; None if there is none."""
     if config.mapping is not None:
         return load_mapping(config.mapping, config.pipeline)
     file = folder_of(config.pipeline) / MAPPING if config.pipeline else None
@@ -112,7 +112,7 @@ def configured_mapping(config: ImportConfig) -> ImportMapping | None:
 
 
 def hints_of(config: ImportConfig) -> ImportHints:
-    """Return what the flags say of files for which there is no mapping: robot, joints, rate, unit."""
+    """Return the flags that help to propose a mapping: robot, joints, rate, unit."""
     more = {"as_told": config.as_told, "unit": config.unit or "", "calibration": config.calibration}
     if config.mjcf is not None:
         name = config.pipeline or pipeline_name(config.mjcf)
@@ -129,15 +129,15 @@ def hints_of(config: ImportConfig) -> ImportHints:
 def hints_of_model(
     mjcf: Path, name: str, joints: tuple[str, ...] = (), rate_hz: float | None = None, **more: Any
 ) -> ImportHints:
-    """Return a model's description of files without a mapping.
+    """Return hints from a model: names, kinds and ranges of its joints.
 
     Args:
-        joints: The joints that were recorded; empty: all of the model's.
-        rate_hz: Samples per second, where a file has no stamps [Hz].
+        joints: The joints that were recorded; empty: all joints of the model.
+        rate_hz: Samples per second, if a file has no stamps [Hz].
         more: Further hints.
 
     Raises:
-        UsageError: When the model has no such joint.
+        UsageError: The model has no such joint.
     """
     model = read_model(mjcf)
     every = joints_of(model)
@@ -148,7 +148,7 @@ def hints_of_model(
 
 
 def pipeline_name(path: Path) -> str:
-    """Return the name of a pipeline for a model: that of its file, without characters that a name cannot have."""
+    """Return the name of a model's file as the name of a pipeline, without characters that are not allowed."""
     return "".join(c if c.isalnum() else "_" for c in path.stem.lower()).strip("_") or "robot"
 
 
@@ -156,16 +156,16 @@ def proposed(table: Table, hints: ImportHints, out: Path | None = None) -> tuple
     """Propose a mapping from a file's names; return it and its text; print the evidence.
 
     Args:
-        out: The log; open questions are written beside it, else into the working directory.
+        out: The log; a mapping with open questions is written beside it, otherwise into the working directory.
 
     Raises:
-        UsageError: When the mapping has open questions, or the data contradict it; it is written into a file to edit.
+        UsageError: The mapping has open questions, or the data contradict it; it is written into a file to edit.
     """
     proposal = Proposal(table, hints)
     try:
         proposal.complete()
     except UsageError as error:
-        for line in table.notes:  # a signal that the file's reader omitted may be the cause
+        for line in table.notes:  # an omitted signal may be the cause
             note(line)
         if not proposal.mapping.nodes:
             raise
@@ -182,7 +182,7 @@ def proposed(table: Table, hints: ImportHints, out: Path | None = None) -> tuple
 
 
 def _write_to_edit(text: str, path: Path, out: Path | None) -> str:
-    """Write a mapping that needs an edit; return the file's name and the command that takes it, as a hint."""
+    """Write a mapping that the user must edit; return a hint with the file and the command that reads it."""
     file = out.with_suffix(".import.toml") if out is not None else Path(f"{path.stem}.import.toml")
     if file.is_file() and file.read_text(encoding="utf-8", errors="replace") != text:
         return f"{file}, which exists with other content, or remove it"
@@ -199,7 +199,7 @@ def refuse_contradictions(path: Path, episode: Episode, as_told: bool, joints: S
     """Refuse a mapping that the data contradict.
 
     Raises:
-        UsageError: When joints follow other commands than their own, or move against them.
+        UsageError: Joints follow commands of other joints, or move against their commands.
     """
     findings = [f for f in checks.check_episode(episode, joints) if f.weight != "note"]
     wrong = [f for f in findings if f.weight == "refuse"]

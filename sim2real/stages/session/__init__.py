@@ -1,1 +1,1 @@
-"""The stage record, and what moves the robot: excitation, open robot, episode."""
+"""The stage record; excitations, and the episodes of record and deploy on an open robot."""

@@ -14,7 +14,7 @@ _FILES = (".mcap", ".csv", ".npz", ".json", ".parquet")
 
 @dataclass(frozen=True)
 class SessionConfig:
-    """What every session with the robot has."""
+    """Settings of every session with the robot."""
 
     port: Annotated[str, Flag("PORT")] = "embedded"
     """Serial port of the servo bus, or 'embedded' for the emulated robot."""
@@ -23,7 +23,7 @@ class SessionConfig:
     seed: int = 0
     """Seed of the embedded robot, and of the excitation of a recording."""
     dry_run: bool = False
-    """Do everything but move the robot: no torque, no goals; what would have been sent is logged and summed up."""
+    """Do everything except move the robot: torque stays off, no goals are sent; the log has the withheld commands."""
     strict_timing: bool = False
     """End with code 5 when more than 1 % of the steps miss their deadline."""
     view: ViewFlag = None
@@ -46,8 +46,9 @@ class RecordConfig(SessionConfig):
     duration_s: float = 40.0
     """Length of the recording [s]."""
     excitation: Annotated[str, Flag("multisine|chirp|steps|hand|standing|FILE")] = "multisine"
-    """Command signal; a file has a motion to play: a log, or csv, npz or parquet columns named by joint; 'hand': torque
-    stays off, a person moves the robot; 'standing': a robot on legs stands up and bends them."""
+    """Command signal, or a file with a motion: a log, or csv, npz or parquet with columns named by joint; 'hand':
+    torque stays off, a person moves the robot; 'standing': a robot on legs stands up and bends its legs.
+    """
     amplitude: float = 1.8
     """Largest command of the excitation [the actuator's unit; V for the pendulum]."""
     low_hz: float = 0.2
@@ -62,7 +63,7 @@ class RecordConfig(SessionConfig):
 
     @property
     def standing(self) -> bool:
-        """Whether a robot on legs is recorded on its feet."""
+        """Whether a robot on legs is recorded while it stands."""
         return self.excitation == STANDING
 
     @property

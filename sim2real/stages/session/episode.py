@@ -1,4 +1,4 @@
-"""The open robot of a stage: one episode after another on the wall clock, their logs, and how well they kept time."""
+"""Runs episodes on an open robot, writes their logs, and reports how well they kept time."""
 
 import math
 import select
@@ -37,25 +37,25 @@ from sim2real.stages.terminal.console import artifact_table, note, progress, tab
 from sim2real.stages.terminal.interruption import interruptible
 
 LATE_SHARE = 0.01
-"""Share of late steps above which ``--strict-timing`` ends with code 5, and of late answers above which it is said."""
+"""Share of late steps above which ``--strict-timing`` ends with code 5; share of late answers that is reported."""
 _POLL_S, _REST_POLL_S = 0.25, 0.02
 WARN_WAITING = 5_000
-"""Age of the record that is being written above which a warning names the slow disk [s]."""
+"""A warning names the slow disk if the record that is being written is older than this [s]."""
 _INTERRUPTED = 130
 
 
 class Watch:
-    """A recorder that passes everything on, and stops the graph on a NaN.
+    """A recorder that passes records on, and stops the graph on a NaN.
 
     Attributes:
-        monotonic_ns: When the episode started.
+        monotonic_ns: Start of the episode on the monotonic clock [ns].
     """
 
     def __init__(self, recorder: Recorder) -> None:
         self._recorder, self.monotonic_ns = recorder, 0
 
     def start(self, epoch_ns: int, monotonic_ns: int) -> None:
-        """Keep when the episode starts."""
+        """Keep the episode's start."""
         self.monotonic_ns = monotonic_ns
         self._recorder.start(epoch_ns, monotonic_ns)
 
@@ -68,16 +68,16 @@ class Watch:
                 raise SafetyStop(f"node {record.node!r} stopped: its output {name!r} is NaN in step {record.seq}")
 
     def message(self, record: MessageRecord) -> None:
-        """Pass the fate of a message on."""
+        """Pass a message on."""
         self._recorder.message(record)
 
 
 @contextmanager
 def opened(robot: Robot, config: SessionConfig, truth_path: Path, hanging: bool = False) -> "Iterator[Bench]":
-    """Open the robot for a stage, with torque off; in a dry run with torque withheld until it is closed.
+    """Open the robot for a stage, with torque off; in a dry run, torque stays off until it is closed.
 
     Args:
-        hanging: Whether a robot on legs hangs in a stand, to be recorded.
+        hanging: Whether emulated legs hang in a stand, for a recording.
     """
     if config.dry_run:
         note("dry run: torque stays off and no goal is sent; what would have been sent is logged")
@@ -106,20 +106,20 @@ class Bench:
         label: str,
         hold: bool = False,
     ) -> None:
-        """Run the graph and log it; after every failure the motors have no torque and the log is readable.
+        """Run the graph and write its log; after any failure the motors have no torque and the log is readable.
 
         Args:
             duration_s: How long to run [s].
-            hold: Whether to hold the robot at its end until Enter is pressed.
+            hold: Whether to hold the robot at the end until Enter is pressed.
 
         Raises:
-            Sim2RealError: What stopped the robot.
+            Sim2RealError: The robot was stopped.
         """
         # Without an agent, as in a recording by hand, the sensor is the only node.
         clock = MonotonicClock() if self.rig.clock is SYSTEM_CLOCK else VirtualClock(self.rig.clock)
         graph = AsyncGraph(nodes, nodes.get(AGENT) or nodes[SENSOR], clock)
         state = graph.init(jax.random.key(0) if has_jax() else None, params)
-        graph.warmup(state)  # every program is compiled before torque goes on
+        graph.warmup(state)  # compile every program before torque goes on
         # Start the log, and run; an interrupted episode comes to rest before torque goes off.
         recorder = self._recorder(graph, state, log)
         watch = Watch(recorder)
@@ -138,11 +138,11 @@ class Bench:
             self.rig.stop_quietly()
             _end(error, graph, recorder, lambda: self._summary(graph, watch))
             raise
-        # A failure ends without torque, and the log holds it.
+        # A failure ends with torque off, and the log has the failure.
         recorder.close("finished", OK, self._summary(graph, watch), note)
 
     def _recorder(self, graph: AsyncGraph, state: GraphState, log: Path) -> McapRecorder:
-        """Return the log's writer, whose metadata describes the session; a dry run comes first."""
+        """Return the log's writer, whose metadata describe the session."""
         # The graph as the log's metadata describes it.
         topology = {
             name: {
@@ -177,10 +177,10 @@ class Bench:
         return McapRecorder(log, metadata, {}, state.aux["outputs"], inputs, joints, units)
 
     def _summary(self, graph: AsyncGraph, watch: Watch) -> dict[str, Any]:
-        """Return what no log of steps and messages has: counters of nodes, bus and gate.
+        """Return the counters of nodes, bus and gate, which steps and messages do not have.
 
         ``bus``: how long the transactions of each node took, see ``BusUse`` [us]; ``late_replies``: answers whose
-        sample's time is not sure, or that came after they had been asked for again.
+        sample's time is uncertain, or that came after the request was repeated.
         """
         rig, counters = self.rig, self.rig.device.counters
         nodes = sorted(graph.statistics().items(), key=lambda item: _place(graph.nodes[item[0]]))
@@ -217,7 +217,7 @@ def _drive(
 
 
 def _end(error: BaseException, graph: AsyncGraph, recorder: McapRecorder, summary: Callable[[], Any]) -> None:
-    """Stop the graph and complete the log; what else goes wrong on the way must not take the place of the reason."""
+    """Stop the graph and complete the log; a further error must not hide the first one."""
     status = f"{type(error).__name__}: {error}"
     with noted(error):
         graph.stop()
@@ -226,13 +226,13 @@ def _end(error: BaseException, graph: AsyncGraph, recorder: McapRecorder, summar
 
 
 def come_to_rest(graph: AsyncGraph, rig: Rig, hold: bool) -> None:
-    """Let commands fade, or goals stay, until the robot is at rest; the graph runs on and its log with it.
+    """Let commands fade, or goals stay, until the robot is at rest; graph and log go on.
 
     Args:
-        hold: Whether to hold it then until Enter is pressed; without a terminal, until a signal comes.
+        hold: Whether to hold the robot then until Enter is pressed; without a terminal, until a signal comes.
 
     Raises:
-        Sim2RealError: What stopped the robot meanwhile.
+        Sim2RealError: The robot was stopped meanwhile.
     """
     if rig.torque_withheld or not graph.running:
         return
@@ -247,8 +247,8 @@ def come_to_rest(graph: AsyncGraph, rig: Rig, hold: bool) -> None:
 
 
 def _told() -> bool:
-    """Wait a moment, and return whether Enter was pressed; an emulated robot must not run ahead of a person."""
-    if not sys.stdin.isatty():  # an input that is closed would let go at once
+    """Wait a moment in real time, also with an emulated robot, and return whether Enter was pressed."""
+    if not sys.stdin.isatty():  # a closed input would release the robot at once
         time.sleep(_REST_POLL_S)
         return False
     ready = bool(select.select([sys.stdin], [], [], _REST_POLL_S)[0])
@@ -256,7 +256,7 @@ def _told() -> bool:
 
 
 def check_deadlines(summary: Mapping[str, Any]) -> None:
-    """Judge an episode for ``--strict-timing``, once everything about it is written."""
+    """Raise an error for ``--strict-timing`` if too many steps were late; called when everything is written."""
     late = [
         f"{name} {node['overruns']} of {node['steps']}"
         for name, node in summary["timing"].items()
@@ -270,7 +270,7 @@ def check_deadlines(summary: Mapping[str, Any]) -> None:
 
 
 def show_sessions(recordings: Sequence[Recording], robot: Robot) -> None:
-    """Print the timing of the last session and the warnings of all; of a dry run the withheld commands, too."""
+    """Print the timing of the last session, warnings of all sessions, and the withheld commands of a dry run."""
     print(artifact_table(recordings[-1].timing.rows()))
     for recording in recordings:
         share = recording.summary["late_replies"] / max(1, recording.summary["transactions"])

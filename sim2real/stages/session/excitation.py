@@ -21,7 +21,7 @@ from sim2real.stages.session.config import RecordConfig
 from sim2real.stages.terminal.console import note
 
 _ROUNDED = 1e-6
-"""Excess over a limit that is a rounding error [the command's unit]."""
+"""A smaller excess over a limit is a rounding error [the command's unit]."""
 _LEAST_S = 1.0
 """Shortest motion [s]."""
 _BEND_HZ = 0.3
@@ -29,10 +29,10 @@ _BEND_HZ = 0.3
 
 
 def played(config: RecordConfig, robot: Robot, announce: bool = False) -> np.ndarray:
-    """Return the signal ``(N, commands)`` around ``RobotDrive.centre``, one row a step.
+    """Return the signal ``(N, commands)`` around ``RobotDrive.centre``, with a row for each step.
 
     Args:
-        announce: Whether it prints which signals of a file are played, and for how long.
+        announce: Whether to print which signals of a file are played, and for how long.
 
     Raises:
         UsageError: The robot cannot play it: the frequencies are too high, or a motion leaves its limits.
@@ -70,14 +70,14 @@ def played(config: RecordConfig, robot: Robot, announce: bool = False) -> np.nda
 def _read_motion(path: Path, robot: Robot, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray, str]:
     """Return the motion in a file: goals if it has them, otherwise measured positions.
 
-    A log of this robot, a file that the pipeline's ``import.toml`` maps, or any file that ``sim2real import`` reads
-    whose columns have the names of the robot's joints.
+    The file is a log of this robot, a file for which the pipeline's ``import.toml`` is a mapping, or any file that
+    ``sim2real import`` reads and whose columns have the names of the robot's joints.
 
     Args:
-        names: The robot's commands.
+        names: Names of the robot's commands.
 
     Returns:
-        Increasing times from 0 ``(N,)`` [s], commands ``(N, commands)`` [the command's unit], and what they are.
+        Increasing times from 0 ``(N,)`` [s], commands ``(N, commands)`` [the command's unit], and a description.
 
     Raises:
         UsageError: The file has no such motion.
@@ -105,7 +105,7 @@ def _read_motion(path: Path, robot: Robot, names: Sequence[str]) -> tuple[np.nda
 
 
 def _of_log(path: Path, robot: Robot) -> tuple[np.ndarray, np.ndarray, str]:
-    """Return the commands of a log; of one that was guided by hand the measured positions."""
+    """Return the commands of a log, or the measured positions if it was guided by hand."""
     episode, field = read_log(path), robot.drive.command
     sent = episode.outputs.get(ACTUATOR, {}).get(field)
     if sent is not None and len(sent):
@@ -121,10 +121,10 @@ def _of_log(path: Path, robot: Robot) -> tuple[np.ndarray, np.ndarray, str]:
 
 
 def _within(rows: np.ndarray, config: RecordConfig, robot: Robot, names: Sequence[str]) -> np.ndarray:
-    """Return the motion without its beginning and its end outside the limits, where an arm lies without torque.
+    """Return the motion without parts outside the limits at its begin and end, where an arm lies without torque.
 
     Raises:
-        UsageError: It leaves the limits in between, or is too fast; the robot has not moved.
+        UsageError: The motion leaves the limits in between, or is too fast; the robot has not moved.
     """
     gate, unit, rate_hz = robot.drive.gate(config.gate), robot.units[robot.drive.command], robot.drive.rate_hz
     low, high = (np.broadcast_to(np.asarray(end, np.float64), rows.shape[1]) for end in gate.range)
@@ -144,7 +144,7 @@ def _within(rows: np.ndarray, config: RecordConfig, robot: Robot, names: Sequenc
     if (beyond[begin:end] > 0.0).any():
         raise UsageError(
             f"{config.motion} leaves the robot's limits: {farthest(begin, end)}",
-            hint="record it again within them; a limit is the smaller one of the robot's and --gate.limit",
+            hint="record it again within the limits; each is the smaller of the robot's limit and --gate.limit",
         )
     speed = np.abs(np.diff(rows[begin:end], axis=0)) * rate_hz
     most = np.inf if gate.slew_per_s is None else gate.slew_per_s
@@ -190,7 +190,7 @@ def excitation(config: RecordConfig, rate_hz: float, commands: int = 1) -> np.nd
 
 
 def bent_legs(crouch: np.ndarray, duration_s: float, rate_hz: float) -> np.ndarray:
-    """Return the commands ``(N, commands)`` of a robot on its feet, which bends its legs slowly and stretches them."""
+    """Return commands ``(N, commands)`` with which a standing robot slowly bends and stretches its legs."""
     t = np.arange(0.0, duration_s, 1.0 / rate_hz)
     return 0.5 * (1.0 - np.cos(2.0 * np.pi * _BEND_HZ * t))[:, None] * crouch
 

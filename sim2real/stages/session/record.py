@@ -30,13 +30,13 @@ def record(robot: AnyRobot, folder: AnyPath, config: RecordConfig | Mapping[str,
     Args:
         robot: The robot, or the name of its pipeline.
         folder: Folder for the log; a log is never overwritten.
-        config: Settings; default: those of the robot. A dict has the settings that differ from these.
+        config: Settings; default: the robot's. A dict has the settings that differ from these.
 
     Returns:
-        The recording; its ``summary`` is that of the session.
+        The recording; ``summary`` has the session's timing.
 
     Raises:
-        Sim2RealError: The robot was stopped; the log holds everything up to then.
+        Sim2RealError: The robot was stopped; the log has everything up to then.
     """
     robot, folder = moving(robot_of(robot)), folder_of(folder)
     config = config_of(config, defaults_of(robot).record)

@@ -1,4 +1,4 @@
-"""The log of simulated commands, for a robot that equals its model."""
+"""Simulates a log: the response of a robot's model to commands."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -27,13 +27,13 @@ def simulate(
     config: FitConfig,
     seed: int = 0,
 ) -> Episode:
-    """Return the log of commands, simulated with the model.
+    """Return the simulated log of a signal.
 
-    It starts at rest; a joint with a goal starts at its first goal.
+    The robot starts at rest; a joint with a goal starts at its first goal.
 
     Args:
-        robot: Its command is excited, at its rate.
-        signal: Shape ``(N, actions)``: one command a step.
+        robot: Gives the field and the rate of the command.
+        signal: Shape ``(N, actions)``: one command for each step.
         config: Largest delay of the model, and the engine.
     """
     # Draw a timeline, and play the signal on it.
@@ -53,7 +53,7 @@ def simulate(
             [jnp.asarray(r[None], jnp.asarray(v).dtype) for r, v in zip(rows.values(), leaves, strict=True)]
         )
         outputs[name] = rows
-    # Start at rest, driven joints at their first goal.
+    # Start at rest, joints with a goal at their first goal.
     graph = OpenLoopGraph(nodes, model.sensor, model.given)
     tables = jax.tree_util.tree_map(lambda rows: jnp.asarray(rows[0]), graph.tables(timeline, commands))
     messages = jax.tree_util.tree_map(lambda rows: rows[0], commands)
@@ -62,7 +62,7 @@ def simulate(
     start = np.array([float(c.of(np.asarray(rest[c.position]))) for c in model.channels])
     start[driven] = [signal[0, model.channels[i].index or 0] for i in driven]
     params = model.params(values, jnp.asarray(np.concatenate([start, np.zeros_like(start)]), jnp.float32))
-    # The first command counts as constant before, as in segments of a log.
+    # Assume that the first command also held before, as in segments of a log.
     gs = graph.begin(params, jax.tree_util.tree_map(lambda rows: rows[0], messages), 0)
     # Simulate by the configured engine.
     if engine.name == "c":
@@ -75,12 +75,12 @@ def simulate(
     # Return the simulation as an episode.
     count = int(timeline.vertices[model.sensor].count[0])
     outputs[model.sensor] = {n: np.asarray(v)[:count] for n, v in named_leaves(records).items()}
-    early = {model.sensor: to_ticks(model.ahead_s)}  # cutting the log into segments adds it again
+    early = {model.sensor: to_ticks(model.ahead_s)}  # the time that cutting into segments adds again
     steps = {n: _steps(timeline.vertices[n], len(next(iter(outputs[n].values()))), early.get(n, 0)) for n in outputs}
     return Episode(steps=steps, messages={}, outputs=outputs, metadata={})
 
 
 def _steps(vertex: Vertex, count: int, early: int) -> Steps:
-    """Return the steps of one drawn node as a log has them, ``early`` ticks before."""
+    """Return the steps of a node as in a log, ``early`` ticks earlier than drawn."""
     start, end = (np.maximum(times[0, :count] - early, 0) for times in (vertex.start, vertex.end))
     return Steps(start, start, start, np.full(count, -1), end, np.zeros(count, np.int64))

@@ -1,4 +1,4 @@
-"""What stages take: objects, their names or their files, each of the robot that the stage is of.
+"""Opens the arguments of stages: objects, names or files, which must belong to the stage's robot.
 
 The functions for Python and the command line open recordings and identifications here; any other value is an error.
 """
@@ -33,7 +33,7 @@ AnyRecording: TypeAlias = Recording | AnyPath
 AnyIdentification: TypeAlias = Identification | AnyPath
 """An identification, its ``parameters.json``, or the folder of an identify stage."""
 AnyBundle: TypeAlias = Bundle | AnyPath
-"""A bundle, its folder, or that of a train stage."""
+"""A bundle, its folder, or the folder of a train stage."""
 AnyTiming: TypeAlias = Timing | AnyPath
 """A timing, or its file."""
 
@@ -43,11 +43,11 @@ def recordings_of(value: Any, robot: RecordedRobot, name: str = "recording") -> 
 
     Args:
         value: A recording, a log, or the folder of a record stage; or several of them.
-        robot: The robot that files must be of.
+        robot: The robot to which logs must belong.
 
     Raises:
-        UsageError: It is something else, or empty.
-        Sim2RealError: There is no such log, or it is of another robot.
+        UsageError: The value is something else, or empty.
+        Sim2RealError: There is no such log, or it belongs to another robot.
     """
     several = isinstance(value, Iterable) and not isinstance(value, Recording | str | Mapping)
     recordings = []
@@ -55,7 +55,7 @@ def recordings_of(value: Any, robot: RecordedRobot, name: str = "recording") -> 
         if isinstance(one, str | PathLike):
             recordings.append(open_recording(Path(one), robot))
         elif isinstance(one, Recording):
-            if "log" in one.episode.metadata:  # it was read from a log of this package
+            if "log" in one.episode.metadata:  # the recording was read from a log of this package
                 _require_owner(one, robot)
             recordings.append(one)
         else:
@@ -70,19 +70,19 @@ def identification_of(value: Any) -> Identification:
     """Return an identification, or that of a file or folder.
 
     Raises:
-        UsageError: It is something else, such as values alone, which have no uncertainty.
+        UsageError: The value is something else, such as a dict of values, which has no uncertainty.
     """
     hint = "sim2real.Identification.load(FOLDER) opens one; values alone have no intervals, timing and verdict"
     return _loaded(value, Identification, "identification", "an Identification, or its folder or file", hint)
 
 
 def bundle_of(value: Any) -> Bundle:
-    """Return a policy bundle, or that of a folder."""
+    """Return a policy bundle; load it if a folder is given."""
     return _loaded(value, Bundle, "bundle", "a Bundle, or its folder", "sim2real.Bundle.load(FOLDER) opens one")
 
 
 def timing_of(value: Any) -> Timing:
-    """Return a timing, or that of a file or folder."""
+    """Return a timing; load it if a file or folder is given."""
     return _loaded(value, Timing, "timing", "a Timing, or its file", "recording.timing is one")
 
 
@@ -100,7 +100,7 @@ def config_of(value: Any, default: T, name: str = "config") -> T:
         value: A configuration, or the fields that differ from the default; None: the default.
         default: The default.
     """
-    # A whole configuration, or fields of one.
+    # The value is a configuration, or a dict of fields.
     kind = type(default)
     if value is None:
         return default
@@ -126,7 +126,7 @@ def config_of(value: Any, default: T, name: str = "config") -> T:
 
 
 def wrong(value: object, name: str, expected: str, hint: str) -> UsageError:
-    """Return the error for an argument of the wrong kind."""
+    """Return the error for an argument of the wrong type."""
     return UsageError(f"{name} must be {expected}; got {type(value).__name__} {reprlib.repr(value)}", hint=hint)
 
 
@@ -147,10 +147,10 @@ def _loaded(value: Any, kind: type[T], name: str, expected: str, hint: str) -> T
 
 
 def open_recording(path: Path, robot: RecordedRobot) -> Recording:
-    """Read a log of a robot, in its units; a log that was cut is used as far as it goes.
+    """Read a log of a robot; a truncated log is read up to its end.
 
-    A file of another recorder is imported in memory, if the robot has a mapping for it; a warning names what its data
-    contradict.
+    A file of another recorder is imported in memory, if the robot has a mapping for it; warnings report contradictions
+    between mapping and data.
     """
     if (mapping := mapping_of(robot, path)) is not None:
         recording = Recording(path, import_file(path, mapping))
@@ -159,7 +159,7 @@ def open_recording(path: Path, robot: RecordedRobot) -> Recording:
         for field in {c.position for c in channels if c.index is not None} & set(read):
             entries = {c.index for c in channels if c.position == field and c.index is not None}
             width = read[field].shape[-1]
-            # A robot of one joint may take an entry of a longer vector.
+            # A robot with one joint may use an entry of a longer vector.
             if max(entries) >= width or (len(entries) > 1 and len(entries) != width):
                 raise UsageError(
                     f"{field!r} has {width} columns in {path}, expected {len(entries)}: {', '.join(joints)}",
@@ -205,7 +205,7 @@ def _require_fitting(recording: Recording, robot: RecordedRobot) -> None:
 
 
 def require_units(recording: Recording, robot: RecordedRobot) -> None:
-    """Check that what the robot's sensor and actuator sent is in the units that the robot computes in."""
+    """Check that the log's sensor and actuator fields have the units of the robot."""
     recorded_units = recording.episode.units or dict.fromkeys((SENSOR, ACTUATOR), recording.units)
     for node in (SENSOR, ACTUATOR):
         for field, unit in recorded_units.get(node, {}).items():
@@ -217,11 +217,12 @@ def require_units(recording: Recording, robot: RecordedRobot) -> None:
 
 
 def in_world_of(identification: Identification, robot: Kind) -> Kind:
-    """Return a robot in the world of an identification, with which it can be simulated.
+    """Return a robot in the world of an identification, for a simulation.
 
     Raises:
         UsageError: The world is not installed.
-        Sim2RealError: It is of another pipeline, was interrupted, did not converge, or lacks parameters.
+        Sim2RealError: The identification is of another pipeline, was interrupted, did not converge, or lacks
+            parameters.
     """
     hint = f"make them with `sim2real identify {robot.name}`"
     if identification.pipeline != robot.name:
@@ -233,5 +234,5 @@ def in_world_of(identification: Identification, robot: Kind) -> Kind:
     expected = robot.identifiable(defaults_of(robot).identify.max_delay_s).parameters.names
     there = {p.name for p in identification.parameters if p.standard_error is not None}
     if lacking := [n for n in expected if n not in there]:
-        raise Sim2RealError(f"these parameters hold no finite estimate of {', '.join(lacking)}", hint=hint)
+        raise Sim2RealError(f"these parameters have no finite estimate of {', '.join(lacking)}", hint=hint)
     return robot

@@ -1,4 +1,4 @@
-"""What a user's text names: a run, its identification or policy; by path, by name, or the newest of a pipeline."""
+"""Finds a run, an identification or a policy by path, by name, or as the newest of a pipeline."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ if TYPE_CHECKING:
 def find_run(root: Path, target: str | Path, pipeline: str | None = None) -> Path:
     """Return a run folder by its path, by its name, by a stage folder in it, or the newest one of a pipeline.
 
-    Of a pipeline's runs the newest with a finished stage is taken: one that failed at its start does not hide it.
+    Of a pipeline's runs, the newest with a finished stage is taken.
 
     Args:
-        pipeline: The pipeline that the run has to belong to; None allows any.
+        pipeline: The pipeline to which the run must belong; None: any.
     """
     path = Path(target)
-    # Only a stage folder selects its parent: that of a pipeline's name would be the working directory.
+    # Only a stage folder selects its parent: the parent of a pipeline's name would be the working directory.
     options = [path.parent if StageFolder.read(path) is not None else path]
     options += [Path(root) / pipeline / path] if pipeline else sorted(Path(root).glob(f"*/{path.name}"))
     for folder in options:
@@ -67,10 +67,10 @@ def find_parameters(source: str, runs: Path, run_dir: Path | None = None) -> Pat
 def find_bundle(source: str, runs: Path, run_dir: Path | None = None) -> Path:
     """Return the folder of the policy bundle that a text names: a bundle, a stage folder, a pipeline or a run.
 
-    A pipeline without a training of its own gives the bundle that it ships.
+    For a pipeline without a training, its shipped bundle is taken.
 
     Args:
-        run_dir: Run in which a pipeline's training is looked for; None: any.
+        run_dir: Run in which a training of the pipeline is searched; None: any.
     """
     from sim2real.artifacts.bundle import BUNDLE
     from sim2real.policy.bundle import CONTRACT
@@ -101,11 +101,11 @@ def _output(source: str, runs: Path, stage: str, name: str, run_dir: Path | None
 
 
 def newest_recording(robot: RecordedRobot, root: Path, run_dir: Path | None = None) -> StageFolder:
-    """Return the newest finished recording of a robot, first of the given run.
+    """Return the newest finished recording of a robot, preferably in the given run.
 
     Raises:
-        UsageError: When there is none, and the robot has no motors to make one with.
-        Sim2RealError: When there is none.
+        UsageError: There is none, and the robot has no motors to make one.
+        Sim2RealError: There is none.
     """
     try:
         return newest(root, robot.name, "record", run_dir)
@@ -115,13 +115,13 @@ def newest_recording(robot: RecordedRobot, root: Path, run_dir: Path | None = No
         if isinstance(robot, Robot):
             raise
         raise UsageError(
-            f"there is no recording of {robot.name!r} in {root}, and the pipeline has no motors to make one with",
+            f"there is no recording of {robot.name!r} in {root}, and the pipeline has no motors to make one",
             hint=f"name a log with --log FILE, or `sim2real import FILE --pipeline {robot.name}`",
         ) from error
 
 
 def warn_of_stale(folder: StageFolder) -> StageFolder:
-    """Return a finished stage that is taken up; print a warning where its run has a newer input of it."""
+    """Return a finished stage; print a warning if its run has a newer input of the stage."""
     if why := why_stale(folder, stage_status(folder.run_dir)):
         note(f"warning: {why}; `sim2real run {folder.manifest.pipeline} --resume {folder.run_dir}` makes it again")
     return folder

@@ -1,4 +1,4 @@
-"""A robot that is described by its model and a log."""
+"""Describes a robot by its model and a log."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from sim2real.stages.terminal.console import note
 from sim2real.types import MjModel
 
 _STEPS_S = (0.0005, 0.005)
-"""Between these, the model's own time step is taken."""
+"""Smallest and largest time step of the simulation; the model's time step is clipped to them [s]."""
 _FASTEST = 0.02
-"""Of the periods between samples, this share is shorter than that of the rate which nodes get."""
+"""The nodes' period is this quantile of the periods between samples."""
 _FACTORS = ("kp", "kd", "goal_velocity", "torque", "duty")
-"""Commands that a parameter is multiplied with."""
+"""Commands on which a parameter is a factor."""
 MODEL_FILE = "robot.xml"
 
 
@@ -43,7 +43,7 @@ class Described:
 
     Attributes:
         name: Name of its pipeline.
-        mapping: Mapping of its logs, which another recorder wrote; None: they are logs of this package.
+        mapping: Mapping of its logs, if another recorder wrote them; None: logs of this package.
     """
 
     name: str
@@ -91,7 +91,7 @@ def describe_robot(flags: RobotFlags, logs: Sequence[str]) -> Described:
 
 
 def _of_joints(mapping: ImportMapping) -> ImportMapping:
-    """Return a mapping with a vector for each field, as joints have it."""
+    """Return the mapping with a vector for each field."""
     replaced = msgspec.structs.replace
     nodes = {
         name: replaced(n, fields={k: replaced(f, source=f.sources) for k, f in n.fields.items()})
@@ -112,9 +112,9 @@ def note_held(description: RobotConfig) -> None:
 
 
 def files_of(description: RobotConfig) -> dict[str, str]:
-    """Return ``robot.toml``, and the model where it needs no other files: name -> text.
+    """Return name -> text of ``robot.toml``, and of the model if it needs no other files.
 
-    A model that needs others, such as meshes, is named by its absolute path.
+    A model that needs other files, such as meshes, stays where it is, and ``robot.toml`` has its absolute path.
     """
     spec, text = read_spec(description.model), description.model.read_text(encoding="utf-8")
     if "<include" in text or any(part.file for part in (*spec.meshes, *spec.hfields, *spec.textures, *spec.skins)):
@@ -129,7 +129,7 @@ def _description(flags: RobotFlags, model: MjModel, episode: Episode) -> RobotCo
     commands, sensed = episode.outputs.get("actuator", {}), episode.outputs.get("sensor", {})
     shaped = [(len(joints),), (1,)]
     driving = tuple(n for n in COMMANDS if n in commands and (n != "volts" or commands[n].shape[1:] in shaped))
-    # A factor of 0 does not determine its parameter: a recorder without the gain writes 0.
+    # A gain that is always 0 means that the recorder lacks it, so its factor is not identified.
     if "goal" in driving and (idle := [n for n in driving if n in _FACTORS and not commands[n].any()]):
         note(f"{', '.join(idle)} is 0 in all of the log: omitted")
         driving = tuple(n for n in driving if n not in idle)
@@ -154,7 +154,7 @@ def _description(flags: RobotFlags, model: MjModel, episode: Episode) -> RobotCo
     step_s = flags.step_s or min(max(float(model.opt.timestep), _STEPS_S[0]), _STEPS_S[1])
     if flags.velocity and "velocity" not in sensed:
         raise UsageError("the log has no velocity", hint="run without --velocity: it is not needed")
-    # A gain kp alone is in a firmware's unit; both gains are those of a motor's torque loop.
+    # A log with kp alone has a firmware's unit; with kp and kd, the gains are those of a torque loop in SI units.
     units = {n: float(np.median(commands[n][commands[n] > 0])) for n in ("kp", "kd") if n in commands}
     description = describe(flags, joints, driving, round(1.0 / fastest, 3), step_s, set(units) == {"kp", "kd"})
     kp_unit = units["kp"] if set(units) == {"kp"} else 1.0
@@ -166,7 +166,7 @@ def _description(flags: RobotFlags, model: MjModel, episode: Episode) -> RobotCo
 def describe(
     flags: RobotFlags, joints: Sequence[str], commands: tuple[str, ...], rate_hz: float, step_s: float, physical: bool
 ) -> RobotConfig:
-    """Return a robot's description by its flags, with the parameters that they name, or the usual ones.
+    """Return a robot's description from flags, with the parameters in the flags, or the usual ones.
 
     Args:
         commands: Fields of the log that drive joints.

@@ -1,4 +1,4 @@
-"""What stages share about an identification: its robot, its segments, the logs it may use, and the command of another.
+"""Shared code about identifications: the robot, segments of logs, logs given twice, and the next command.
 
 Imports no JAX: the robot's computer checks recordings, too.
 """
@@ -28,15 +28,15 @@ from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.load import defaults_of
 
 _ANY_DELAY_S = 0.1
-"""The names of a model's parameters do not depend on its longest delay, so any does [s]."""
+"""Any longest delay [s]: the names of a model's parameters do not depend on it."""
 _WINDOW_SPACING_S = 0.5
 """Distance between the starts of held-out segments [s]."""
 _LONG_S = 5.0
-"""Length of the segments of the last refinement of a robot that follows no goals [s]."""
+"""Length of the segments of the last refinement, for a robot without goals [s]."""
 _EDGES_S = (0.3, 0.2)
-"""Unused time at the beginning and at the end of a log whose initial states are estimated [s]."""
+"""Unused time at the beginning and at the end of a log [s]."""
 _PIECE = 50
-"""Samples in a piece of motion; two logs that hold the same piece hold the same recording."""
+"""Number of samples in a piece of motion; two logs with the same piece have the same recording."""
 _SAME = 1e-5
 """Largest difference by rounding, as a share of the range of a piece."""
 
@@ -63,7 +63,7 @@ def with_wanted_terms(table: ParameterTable, wanted: str) -> ParameterTable:
 
 
 def offering(robot: RecordedRobot, wanted: str) -> RecordedRobot:
-    """Return the robot with the optional terms that its kind offers, if a flag selects among them.
+    """Return the robot with all optional terms that its class offers, if a flag selects among them.
 
     Args:
         wanted: As in ``with_wanted_terms``.
@@ -101,11 +101,11 @@ def spans(episodes: Sequence[Episode], fitted: int, config: IdentifyConfig, leng
     """Return segments of one length, fitted and held out.
 
     Args:
-        episodes: The logs; those that are held out whole come last.
+        episodes: The logs; logs that are held out as a whole come last.
         length_s: Length of a segment [s].
 
     Raises:
-        UsageError: When the logs are too short.
+        UsageError: The logs are too short.
     """
     segments: list[Span] = []
     for r, episode in enumerate(episodes):
@@ -133,10 +133,10 @@ def with_length(config: IdentifyConfig, model: IdentifiableModel) -> IdentifyCon
 
 
 def long_spans(episodes: Sequence[Episode], fitted: int, config: IdentifyConfig) -> list[Span]:
-    """Return the segments of the last refinement, which together contain all fitted samples; none if no log has two.
+    """Return the segments of the last refinement, which contain all fitted samples; none if no log has two.
 
     Args:
-        fitted: Number of fitted logs; the later ones are held out whole.
+        fitted: Number of fitted logs; the later logs are held out as a whole.
     """
     ends = [(usable(e, config)[0], split_of(e, True, config)) for e in episodes[:fitted]]
     return covering(ends, config.long_s or 0.0)
@@ -157,7 +157,7 @@ def covering(ends: Sequence[tuple[float, float]], length_s: float) -> list[Span]
 def side_by_side(
     episodes: Sequence[Episode], config: IdentifyConfig, lengths_s: Sequence[float], fitted: bool = True
 ) -> list[Span]:
-    """Return segments side by side in the usable parts of logs, of a length for each log [s]."""
+    """Return segments side by side in the usable parts of logs; each log has its own length of segments [s]."""
     segments: list[Span] = []
     for r, (episode, length_s) in enumerate(zip(episodes, lengths_s, strict=True)):
         begin, end = usable(episode, config)
@@ -168,8 +168,9 @@ def side_by_side(
 def usable(episode: Episode, config: IdentifyConfig) -> tuple[float, float]:
     """Return the begin and the end of the part of a log that can be cut into segments [s].
 
-    An estimate of an initial state needs samples before and after the start of the segment. The end is 0.05 to
-    0.15 s early, at a multiple of the grid: logs of 19.96 s and 20.04 s have the same segments and share programs.
+    An estimate of an initial state needs samples before and after the start of the segment. The end is 0.05 to 0.15 s
+    before the log's end, at a multiple of 0.1 s, so that logs of 19.96 s and 20.04 s have the same segments and share
+    programs.
     """
     before, after = _EDGES_S if config.initial_state == "free" else (0.0, 0.0)
     begin = max(before, config.after_s)
@@ -180,7 +181,7 @@ def split_of(episode: Episode, fitted: bool, config: IdentifyConfig) -> float:
     """Return the begin of the held-out part of a log [s].
 
     Args:
-        fitted: Whether the log is fitted; else it is held out whole.
+        fitted: Whether the log is fitted; otherwise it is held out as a whole.
     """
     begin, end = usable(episode, config)
     return begin + float(on_grid((1.0 - config.held_out) * (end - begin), np.floor)) if fitted else begin
@@ -216,7 +217,7 @@ def was_fitted(identification: Identification, logs: Sequence[Recording], model:
 
 
 def require_apart(fitted: Sequence[Recording], held_out: Sequence[Recording], model: IdentifiableModel) -> None:
-    """Raise an error if a log is given twice: fitted and held out, or fitted two times.
+    """Raise an error if a log is given twice: as fitted and held out, or twice as fitted.
 
     Raises:
         UsageError: A log is given twice.
@@ -239,7 +240,7 @@ def require_apart(fitted: Sequence[Recording], held_out: Sequence[Recording], mo
 
 
 def hash_of(log: Recording) -> str:
-    """Return the SHA-256 of a log's file; "" if there is no such file."""
+    """Return the SHA-256 of a log's file; "" if there is no file."""
     return sha256(log.path) if log.path.is_file() else ""
 
 
@@ -264,7 +265,7 @@ def _contains(read: np.ndarray, piece: np.ndarray) -> bool:
     if len(read) < size or read.shape[1:] != piece.shape[1:]:
         return False
     slack = _SAME * np.ptp(piece, axis=0).max()
-    # Compare the ends and the middle first: few places match there.
+    # Compare the ends and the middle first, where few places match.
     ends = [
         np.abs(read[i : len(read) - size + 1 + i] - piece[i]).max(axis=1) <= slack for i in (0, size // 2, size - 1)
     ]
@@ -279,7 +280,8 @@ def command(robot: RecordedRobot, config: IdentifyConfig, root: Path, flags: str
 
     Args:
         robot: The robot; settings that equal its defaults need no flag.
-        flags: Further flags; they replace those of the settings, bounds and fixed values parameter by parameter.
+        flags: Further flags, which replace flags of the settings; bounds and fixed values are replaced for each
+            parameter.
     """
     further = shlex.split(flags)
     if robot.folder is None:
@@ -305,7 +307,7 @@ def command(robot: RecordedRobot, config: IdentifyConfig, root: Path, flags: str
 
 
 def _exactly(value: float) -> str:
-    """Return a number as a word, without a change of its value."""
+    """Return a number as text, exactly."""
     return short if float(short := f"{value:g}") == value else repr(value)
 
 

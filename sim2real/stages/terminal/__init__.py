@@ -1,1 +1,1 @@
-"""The terminal: results and messages, and what a signal does to a command."""
+"""The terminal: results, messages, and signals that end a command."""

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 _TICK_S = 1.0
 """Period of a terminal's progress display [s]."""
 _LINES_S = (1.0, 2.0, 4.0, 8.0, 15.0)
-"""When a log file gets a line of progress [s after its start]; after the last one, a line each time as long again."""
+"""Times at which a log file gets a line of progress [s after the start]; later lines come at doubling intervals."""
 _ANEW_S = 0.1
 """Shortest time between two displays on a terminal [s]."""
 _CLEAR = "\r\033[K"
@@ -103,7 +103,7 @@ def _is_numeric(column: Sequence[Any]) -> bool:
 
 
 class Bar:
-    """Progress of an activity. A terminal shows it on one line, a log file gets fewer and fewer lines.
+    """Progress of an activity. On a terminal it is one line; in a log file it is a few lines, at growing intervals.
 
     Attributes:
         n: Steps that were done.
@@ -121,7 +121,7 @@ class Bar:
         self.refresh()
 
     def refresh(self) -> None:
-        """Show the present state, where it is time."""
+        """Show the present state, if a display is due."""
         with self._lock:
             passed_s = time.monotonic() - self._begun_s
             if passed_s < self._due_s or not self._visible:
@@ -147,7 +147,7 @@ class Bar:
         self._postfix = text
 
     def end(self, how: str) -> None:
-        """Print how long it took; a terminal's line vanishes."""
+        """Print how long the activity took; remove the terminal's line."""
         if self._visible and self._terminal:
             _on_line("")
         elif self._visible:
@@ -169,11 +169,11 @@ class Bar:
 
 @contextmanager
 def progress(total: float | None, desc: str, shown: bool = True) -> Iterator[Bar]:
-    """Show progress on stderr. The time goes on while one step takes long.
+    """Show progress on stderr; the shown time also advances during a long step.
 
     Args:
         total: Number of steps; None if unknown.
-        shown: False shows nothing: another process does.
+        shown: Whether to show it; of several processes, one shows it.
     """
     bar = Bar(total, desc, shown)
     try:
@@ -189,7 +189,7 @@ def note(text: str, urgent: bool = False) -> None:
     """Print a message on stderr, without breaking a progress display.
 
     Args:
-        urgent: Whether a person must act on it now: it is printed even where output is held back. Warnings are, too.
+        urgent: Whether a person must act now: it is printed even while output is held back, like warnings.
     """
     if _brief is not None:
         if not urgent and not text.startswith("warning:"):
@@ -207,7 +207,7 @@ def _on_line(text: str) -> None:
 
 
 class _Brief:
-    """Output that is held back: its text, and what is done at the moment."""
+    """Output that is held back, and the present activity."""
 
     def __init__(self) -> None:
         self.text, self.activity = io.StringIO(), ""
@@ -238,7 +238,7 @@ def brief() -> Iterator[None]:
         with redirect_stdout(held.text), _ticking(tick):
             yield
     except BaseException:
-        # The details may name the cause: a person who asked for few lines needs them now.
+        # Print the details after a failure: they may name the cause.
         sys.stderr.write(f"\n{held.text.getvalue()}")
         raise
     finally:

@@ -19,7 +19,7 @@ _soft = threading.Event()
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Let the next signal raise an exception, though one has come already."""
+    """Let the next signal raise an exception, even after an earlier signal."""
     _soft.set()
     try:
         yield
@@ -31,9 +31,9 @@ class SignalHandling:
     """Turns SIGINT, SIGTERM and SIGHUP into exceptions, so that every ``finally`` runs: torque off, logs closed.
 
     Only the first signal raises an exception: a second Ctrl-C must not interrupt the clean-up that takes the torque
-    off. What may take its time after the first, such as a soft stop, is done in ``interruptible``, where the next one
-    raises again. If the exception is raised where Python ignores exceptions (in a finaliser or a callback of the
-    garbage collector), the signal is sent again.
+    off. Clean-up that may take long, such as a soft stop, runs in ``interruptible``, where the next signal raises
+    again. If the exception is raised where Python ignores exceptions (in a finaliser or a callback of the garbage
+    collector), the signal is sent again.
 
     Attributes:
         received: Number of the signal that raised an exception; 0 before.
@@ -65,7 +65,7 @@ class SignalHandling:
         if self._raised is not None and not _soft.is_set():
             os.write(2, b"still cleaning up\n")  # print() is not safe inside a signal handler
             return
-        # Python ignores an exception in the hook, too: wait until the hook has returned.
+        # Python also ignores an exception in this hook: wait until the hook has returned.
         while frame is not None:
             if frame.f_code is SignalHandling._dropped.__code__:
                 self._send_later(number)
@@ -91,8 +91,8 @@ def patiently(work: Callable[[], Result]) -> Result:
     """Run a long computation in another thread, so that a signal is handled at once.
 
     Python handles signals between bytecode instructions of the main thread, and a single call into XLA may compile for
-    a minute. The signal does not stop the computation itself, which ends with the process; so its callbacks must write
-    no file after the caller has left. An exception in it is raised here.
+    a minute. The signal does not stop the computation, which ends with the process: its callbacks must not write files
+    after the caller has left. An exception of the computation is raised here.
     """
     # Work in a thread, so that the main thread receives signals at once.
     outcome: list[Result] = []

@@ -35,7 +35,7 @@ from sim2real.types import Json
 Watch = Callable[[Progress], None]
 """A function that receives the figures of each evaluation."""
 _MAX_OBSERVATIONS = 1000
-"""Number of observations of one source that are compared."""
+"""Number of observations from training, and from the log, that are compared."""
 
 
 def bundle_of_training(
@@ -50,7 +50,7 @@ def bundle_of_training(
     policy, weights = result.best, result.best.to_weights()
     graph = export_graph(policy)
 
-    # Observations: the last ones of the training, and those of a robot's recording.
+    # Take observations from the end of the training, and from the robot's recording.
     observations = {"training": result.observations[:_MAX_OBSERVATIONS]}
     if recording is not None and has_readings(setup.robot, recording):
         runner = make_runner(weights, contract, None, policy.spec, graph)
@@ -91,7 +91,7 @@ def bundle_of_training(
 def contract_of(
     robot: Robot, task: TrainingTask, values: Mapping[str, float], episodes: Episodes | None = None
 ) -> PolicyContract:
-    """Return the contract of a policy: observation, action, and the delays of its training."""
+    """Return the contract of a policy: observation, action, and the delays in its training."""
     # The range of the round trip over the episodes, and the 1 and 99 % quantiles of each node's steps [s].
     trained: dict[str, tuple[float, float]] = {}
     if episodes is not None and set(DELAYS) <= set(values):
@@ -117,7 +117,7 @@ def contract_of(
 
 
 def has_readings(robot: Robot, recording: Recording) -> bool:
-    """Return whether a log has all readings of a robot; one of another recorder may lack velocities."""
+    """Return whether a log has all readings of a robot; an imported log may lack velocities."""
     return set(named_leaves(robot.drive.at_rest)) <= set(recording.episode.outputs.get(SENSOR, {}))
 
 
@@ -130,7 +130,7 @@ def _observations(robot: Robot, recording: Recording, runner: PolicyRunner) -> n
     columns = [recording.episode.outputs[SENSOR][name] for name in named_leaves(robot.drive.at_rest)]
     columns = [c.astype(np.float32).reshape(-1, *np.shape(leaf)) for c, leaf in zip(columns, leaves, strict=True)]
 
-    # Play the agent over them.
+    # Let the agent make observations from them.
     params = in_numpy(agent.init_params(None, GraphState()))
     state = StepState(params=params, state=in_numpy(agent.init_state(None, GraphState(params={agent.name: params}))))
     observations, zero = [], np.zeros(1, np.float32)
@@ -144,8 +144,8 @@ def _observations(robot: Robot, recording: Recording, runner: PolicyRunner) -> n
 
 
 def _reference(policy: Policy, observations: np.ndarray) -> PolicyReference:
-    """Return JAX's actions for observations ``(N, O)``, as those of one episode."""
-    # On the processor: an accelerator multiplies matrices with less precision, by 1e-3 of the range.
+    """Return JAX's actions for observations ``(N, O)``, treated as one episode."""
+    # Compute on the CPU: an accelerator's matrix products are less precise, by 1e-3 of the range.
     policy, x = jax.device_put((policy, observations), jax.devices("cpu")[0])
     actions = jax.jit(lambda policy, x: jax.lax.scan(policy.step, policy.initial_carry(), x)[1])(policy, x)
     return PolicyReference(observations, np.asarray(actions))

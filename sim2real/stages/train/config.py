@@ -18,8 +18,9 @@ class TrainConfig:
     resume: Annotated[str | None, Flag("RUN|newest")] = None
     """Interrupted training to continue: its folder, its run, or 'newest' for the pipeline's newest."""
     sweep: tuple[str, ...] = ()
-    """Settings of PPO to try side by side, such as learning_rate=1e-3,3e-3, one flag a setting; every combination with
-    every seed, the best policy of all is saved."""
+    """Settings of PPO to try in parallel, such as learning_rate=1e-3,3e-3; repeat the flag for each setting. Every
+    combination is trained with every seed, and the best policy is saved.
+    """
     checkpoint: bool = True
     """Write the whole training into a file after each evaluation, to continue from with --resume."""
     hosts: HostsConfig = field(default_factory=HostsConfig)
@@ -27,21 +28,21 @@ class TrainConfig:
     ppo: PPOConfig = field(default_factory=PPOConfig)
     """The learning algorithm."""
     model: Literal["identified", "nominal"] = "identified"
-    """Parameters to train on: the estimates of identify, or the nominal ones without any delay."""
+    """Parameters to train on: the estimates of identify, or nominal values without delays."""
     parameters: Annotated[str | None, Flag("RUN|PIPELINE|PARAMETERS")] = None
     """Identification to train on: parameters.json, its folder, or a run; default: the newest of the pipeline."""
     force: bool = False
     """Train on an identification whose verdict is not 'accepted'."""
     explain: bool = False
-    """Show the distributions that episodes are drawn from beside the recorded ones, and train nothing."""
+    """Do not train; show the distributions from which episodes are drawn, with the recorded values."""
     world: str | None = None
-    """World of an installed package to train in; default: the one of the identification, or the robot's own."""
+    """World of an installed package to train in; default: the identification's, or the robot's own."""
     timelines: int = 32
     """Timelines drawn from the recorded timing."""
     episode_s: float = 5.0
     """Length of an episode [s]."""
     randomise: float = 1.0
-    """Factor on the deviations of parameters and delays between copies: 0 none, 1 those of the identification."""
+    """Factor on the standard deviations of parameters and delays between copies: 0: none, 1: as identified."""
     vary: VariationConfig = field(default_factory=VariationConfig)
     """Differences between episodes."""
     seed: int = 0
@@ -59,7 +60,7 @@ class TrainConfig:
             )
         if self.explain and self.hosts.several:
             raise UsageError(
-                "explain trains nothing: it takes one process",
+                "explain does not train, and runs in one process",
                 hint="run it in one process, without --hosts.found and --hosts.processes",
             )
         if not 0.0 <= self.randomise <= 10.0:

@@ -24,10 +24,10 @@ from sim2real.training.networks.policy import Policy
 from sim2real.training.ppo.rollout import evaluate
 
 TIMELINES = 8
-"""Timelines that the episodes are drawn from."""
+"""Number of timelines from which episodes are drawn."""
 MULTIPLES = np.array([-8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0])
 _EPISODES = 16
-"""Episodes of each model. All models play the same episodes, so differences come from the parameter."""
+"""Number of episodes of each model. All models play the same episodes, so differences come from the parameter."""
 
 
 def policy_sensitivity(
@@ -49,12 +49,12 @@ def policy_sensitivity(
 
 @dataclass(frozen=True)
 class Move:
-    """A parameter that is moved.
+    """Moves of one parameter.
 
     Attributes:
         half_width: Half the width of its 95 % interval [unit].
-        values: Shape ``(M,)``: the values that it is moved to [unit].
-        models: For each of them, the values of all parameters that differ from the estimates.
+        values: Shape ``(M,)``: the values to which it is moved [unit].
+        models: For each value, all parameters that then differ from the estimates.
     """
 
     name: str
@@ -68,10 +68,10 @@ class Move:
 def moves_of(identification: Identification) -> list[Move]:
     """Return the moves of each parameter of the dynamics, each delay and the sum of all delays.
 
-    The other parameters take their most likely values, by the covariance of the identification, given the moved one. A
-    recording often determines a combination well and its parts badly, such as the sum of two delays: parts that move
-    alone would break every policy, in models that contradict the recording. A move ends at a parameter's bound.
-    Parameters without interval do not move.
+    The other parameters take their most likely values given the moved one, by the covariance of the identification. A
+    recording often determines a combination well, such as the sum of two delays, and its parts badly: a part that moved
+    alone would contradict the recording and break every policy. A move ends at a parameter's bound. Parameters without
+    an interval do not move.
     """
     if (posterior := identification.posterior) is None:
         return []
@@ -83,13 +83,13 @@ def moves_of(identification: Identification) -> list[Move]:
             continue
         models = tuple(_most_likely(posterior, p.name, p.estimate, float(multiple * half)) for multiple in MULTIPLES)
         values = np.array([model[p.name] for model in models])
-        name = ROUND_TRIP if p.name in DELAYS else p.name  # the other side's delay is held
+        name = ROUND_TRIP if p.name in DELAYS else p.name  # the other delay is fixed
         moves.append(Move(name, p.unit, p.estimate, half, values, models))
     return moves
 
 
 def _most_likely(posterior: Posterior, name: str, estimate: float, by: float) -> dict[str, float]:
-    """Return the most likely parameters, given that one of them has moved from its estimate by a length [its unit]."""
+    """Return the most likely parameters, given that one has moved from its estimate by ``by`` [its unit]."""
     # The move on the scale of the posterior, within the bounds.
     moved = posterior.names.index(name)
     kind = posterior.transform[moved]
@@ -97,7 +97,7 @@ def _most_likely(posterior: Posterior, name: str, estimate: float, by: float) ->
     to_scale = TRANSFORMS[kind][0]
     step = to_scale(np.clip(estimate + by, low, high)) - to_scale(estimate)
 
-    # The others follow by regression on the moved one; all stop where the first reaches its bound.
+    # The others follow by regression on the moved one; all stop when the first one reaches its bound.
     spread = posterior.covariance[moved]
     shift = step * (spread / spread[moved] if spread[moved] > 0.0 else np.eye(len(spread))[moved])
     room = np.where(shift > 0, posterior.upper, posterior.lower) - posterior.mean
@@ -117,16 +117,16 @@ def _round_trip(values: Mapping[str, float]) -> float:
 
 
 def room_s(models: Sequence[Mapping[str, float]]) -> float:
-    """Return the largest deviation of a model's delay from that of the first model, for the room in a graph [s]."""
+    """Return the largest deviation of a model's delay from the first model's [s], for which windows need room."""
     if not set(DELAYS) <= set(models[0]):
         return DELAY_SPREAD_S
     return max(DELAY_SPREAD_S, *(abs(_round_trip(m) - _round_trip(models[0])) for m in models))
 
 
 def fitted_to_graph(models: Sequence[Mapping[str, float]], tick_s: float, spread_s: float) -> list[dict[str, float]]:
-    """Return the models with the actuator's delay of the first; the sensor's delay takes the whole difference.
+    """Return the models with the first model's actuator delay; the sensor's delay takes the whole difference.
 
-    Only the sum of both delays affects a policy's observations of its commands; see ``split_delay``.
+    A policy notices only the sum of both delays; see ``split_delay``.
     """
     base = split_delay(models[0], tick_s, spread_s)
     if not set(DELAYS) <= set(base):
@@ -146,11 +146,11 @@ def sensitivity(
     """Play a policy on every model, all in one program.
 
     Args:
-        env: With room for the delays of all models.
+        env: Environment with room for the delays of all models.
     """
     columns = {name: jnp.asarray([m[name] for m in models], jnp.float32) for name in models[0]}
 
-    # One episode for each copy; a rollout is as long as an episode.
+    # Each copy plays one episode, so a rollout is as long as an episode.
     rows = env.length + 1
     config = PPOConfig(num_envs=_EPISODES, minibatches=1, rollout_steps=rows, eval_steps=rows)
     key, task = jax.random.key(seed), cast(LoopTask, env.task)
@@ -159,7 +159,7 @@ def sensitivity(
         environment = GraphEnvironment(env.graph, task.with_data((values, {})))
         return evaluate(environment, config, policy, key)["success"]
 
-    # The first model has the estimates; the others are those of the moves, in order.
+    # The first model has the estimates; the models of the moves follow, in order.
     success = np.asarray(jitted(jax.vmap(play))(columns), np.float64)
     by_move = zip(moves, success[1:].reshape(len(moves), len(MULTIPLES)), strict=True)
     moved = [Moved(m.name, m.unit, m.estimate, m.half_width, m.values, s) for m, s in by_move]

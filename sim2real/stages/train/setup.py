@@ -1,4 +1,4 @@
-"""What a training draws its episodes from: the identification, the robot's timing, and the configured variation."""
+"""Prepares a training: draws episodes from the identification, the robot's timing and the configured variation."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ from sim2real.training.environment.timelines import RecordedTiming, TimelineDraw
 from sim2real.training.environment.variation import VariationConfig
 
 _MAX_TIMES = 5000
-"""Number of times that are kept for pictures."""
+"""Number of drawn times that are kept for figures."""
 _COUNT = 1024
-"""Number of starts that are drawn to be shown, and the approximate number of pushes."""
+"""Number of starts that are drawn for figures, and the approximate number of pushes."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class TrainingSetup:
 
     Attributes:
         robot: The robot, in the world of the training.
-        episodes: The distributions that episodes are drawn from.
+        episodes: The distributions from which episodes are drawn.
     """
 
     robot: Robot
@@ -63,7 +63,7 @@ def prepare(
 
     Args:
         timing: The robot's timing; default: that of the identification's recording. The nominal model has no delays.
-        changed: Parameters with other values than the model's; the nominal model has delays if both are among them.
+        changed: Values of parameters that replace the model's; the nominal model has delays if both are given.
         spread_s: Largest deviation of an episode's delay, for which the graph has room [s].
 
     Raises:
@@ -76,7 +76,7 @@ def prepare(
     has_posterior = identification is not None and identification.posterior is not None
     identified = identification.values if identification and has_posterior else None
     usual_values = robot.nominal() | (identified or {})
-    # A data sheet has no delays: ranges of both give the loop delays.
+    # A data sheet has no delays: the loop has delays only if both have ranges.
     ranged = {n: sum(config.vary.range[n]) / 2 for n in DELAYS if n in config.vary.range and n not in usual_values}
     values = _replaced(usual_values, {**ranged, **(changed or {})})
     rng = np.random.default_rng(config.seed)
@@ -123,7 +123,7 @@ def prepare(
 def check_identification(
     robot: RecordedRobot, config: TrainConfig, identification: Identification | None
 ) -> Identification | None:
-    """Return an identification that may be trained on; None for the nominal model.
+    """Return an identification on which to train; None for the nominal model.
 
     Raises:
         Sim2RealError: It is not accepted, and ``config.force`` is not set; or it is of another robot.
@@ -145,7 +145,7 @@ def check_identification(
 
 
 def timing_of(identification: Identification) -> Timing:
-    """Return the timing of the identification's recording, otherwise raise a ``Sim2RealError``."""
+    """Return the timing of the identification's recording; raise a ``Sim2RealError`` if it is missing."""
     if identification.timing is None:
         raise Sim2RealError(
             "the timing of this identification is missing: there is no timing.json beside it",
@@ -168,7 +168,7 @@ def _world(config: TrainConfig, identification: Identification | None) -> str | 
 
 
 def _replaced(values: Mapping[str, float], changed: Mapping[str, float]) -> dict[str, float]:
-    """Return the model's values with others in place of some."""
+    """Return the model's values, some of them replaced."""
     available = dict.fromkeys([*values, *DELAYS])
     if unknown := sorted(set(changed) - set(available)):
         raise UsageError(f"there is no parameter {unknown[0]!r}. Available: {', '.join(available)}")
@@ -179,11 +179,11 @@ def _replaced(values: Mapping[str, float], changed: Mapping[str, float]) -> dict
     return replaced
 
 
-# -- the differences between episodes, as distributions to show
+# -- the distributions of episodes, for figures and tables
 
 
 def _set_noise(sensor: SimSensor, identification: Identification | None, config: TrainConfig) -> tuple[Noise, ...]:
-    """Give the simulated sensor the noise of the log; return it.
+    """Give the simulated sensor the noise of the log; return the noise.
 
     Readings that no log determines, such as the orientation of a robot in a stand, keep the robot's nominal noise. So
     do offsets, which are constant in a log.
@@ -234,7 +234,7 @@ def _episodes(
         ends = (trip.low95, trip.high95) if trip is not None else (None, None)
         rows.append(Varied(ROUND_TRIP, "s", sum(values[n] for n in delays), *ends))
 
-    # Computation times of each node, which are those of the robot if they were recorded.
+    # Computation times of each node, on the robot if they were recorded.
     drawn_s = {
         n: ((v.end - v.start)[np.arange(v.start.shape[1]) < v.count[:, None]] / TICKS_PER_S)
         for n, v in drawn.timeline.vertices.items()
@@ -258,7 +258,7 @@ def _with_disturbances(
     episodes: Episodes, vary: VariationConfig, task: TrainingTask, pushes: Pushes | None, seed: int
 ) -> Episodes:
     """Return the episodes' distributions with pushes and starts, at the end of the curriculum."""
-    # Scale parameters by the curriculum's last share.
+    # Scale parameters as at the end of the curriculum.
     share = vary.curriculum[1]
     last = jnp.float32(share) if vary.grows else None
     k_push, k_start = jax.random.split(jax.random.key(seed))

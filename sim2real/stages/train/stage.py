@@ -60,10 +60,10 @@ def train(
     Args:
         robot: The robot, or the name of its pipeline.
         identification: An identification, or its folder; the nominal model needs none.
-        config: Settings; default: those of the robot. A dict has the settings that differ from these. The
-            function does not read the files that it names.
+        config: Settings; default: the robot's. A dict has the settings that differ from these. Files in the settings
+            are not read.
         timing: The robot's timing; default: that of the identification's recording. The nominal model has no delays.
-        checkpoint: File that receives the whole training after each evaluation; None: none is written.
+        checkpoint: File to which the whole training is written after each evaluation; None: no file.
         resume: A checkpoint of the same training, to continue from.
         watch: Receives the figures of each evaluation.
         log: A recording; the bundle's policy is compared with JAX on the observations in it.
@@ -89,7 +89,7 @@ def train(
     port = "" if recording is None else str(recording.episode.metadata.get("port", ""))
     contract = replace(contract, robot=robot.name if robot.folder is not None else "", port=port)
 
-    # Train; then move each parameter, and play the policy.
+    # Train; then play the policy with each parameter moved.
     write, read = (None if path is None else Path(path) for path in (checkpoint, resume))
     result = _learn(setup, config, write, read, watch)
     weakness = None
@@ -115,7 +115,7 @@ def _learn(
 
 
 def show_progress(bar: Any, p: Progress, watch: Watch | None) -> None:
-    """Show an evaluation's figures behind the progress bar, after ``watch`` has received them."""
+    """Show an evaluation's figures next to the progress bar, after ``watch`` has received them."""
     if watch is not None:
         watch(p)
     bar.set_description_str("train")
@@ -128,7 +128,7 @@ def run(robot: RecordedRobot, config: TrainConfig, root: Path, run_dir: Path | N
     """Train, and write the policy bundle into a stage folder; of several processes the first one writes.
 
     Args:
-        run_dir: Run folder to add to; None: that of the parameters, or a new one for the nominal model.
+        run_dir: Run folder to add to; None: the parameters' run, or a new one for the nominal model.
 
     Returns:
         The stage; None in a process that writes nothing.
@@ -158,14 +158,14 @@ def run(robot: RecordedRobot, config: TrainConfig, root: Path, run_dir: Path | N
     if config.explain:
         return _explain(robot, config, identification, files, root, run_dir)
 
-    # Wait for all processes: the first one's new folder must not be an input of a slower one.
+    # Wait for all processes: the new folder of the first must not become an input of a slower one.
     with lost_process_errors():
         wait_for_all("all processes have read their inputs")
     if not leads():
         train(robot, identification, config, checkpoint=Path(CHECKPOINT), resume=resume)
         return None
 
-    # Train, write the bundle with the hashes of the files that it came from, and print.
+    # Train, write the bundle with the hashes of its input files, and print.
     with open_stage(root, robot.name, "train", config, files, run_dir) as stage:
         with resumable(stage.folder) as checkpoint:
             file, log = checkpoint if config.checkpoint else None, _recording(identification, stage.run_dir)
@@ -190,7 +190,7 @@ def _explain(
     root: Path,
     run_dir: Path | None,
 ) -> StageFolder:
-    """Write and print the distributions into a stage folder ``explain``."""
+    """Print the distributions, and write them into a stage folder ``explain``."""
     with open_stage(root, robot.name, "explain", config, inputs, run_dir) as stage:
         episodes = prepare(robot, config, identification).episodes
         for name, file in episodes.save(stage.folder).items():
@@ -215,7 +215,7 @@ def _explain(
 
 
 def _recording(identification: Identification | None, run_dir: Path) -> Recording | None:
-    """Return the recording of an identification; None without its file, which training does not need."""
+    """Return the recording of an identification; None if its file is missing, as training does not need it."""
     if identification is None or not identification.logs:
         return None
     path = run_dir / identification.logs[0].path
@@ -239,14 +239,14 @@ def resumable(folder: Path) -> Iterator[Path]:
         if file.is_file():
             note(f"the same command with `--resume {shown(folder)}` continues from the last evaluation")
         raise
-    file.unlink(missing_ok=True)  # a finished training needs none
+    file.unlink(missing_ok=True)  # a finished training needs no checkpoint
 
 
 def find_interrupted(pipeline: str, config: TrainConfig, root: Path) -> StageFolder | None:
     """Return the interrupted training that ``config.resume`` names; None without ``config.resume``."""
     if config.resume is None:
         return None
-    # List the trainings in a run, in a pipeline's runs, or the one of a stage's folder.
+    # List the trainings in a run or in a pipeline's runs, or take the training of a stage's folder.
     named = StageFolder.read(Path(config.resume))
     if named is not None and named.stage == "train":
         trainings = [named]
@@ -257,7 +257,7 @@ def find_interrupted(pipeline: str, config: TrainConfig, root: Path) -> StageFol
         runs = run_folders(root, pipeline) if newest_one else [find_run(root, config.resume, pipeline)]
         trainings = [attempt for run in runs for attempt in attempts(run, "train")]
 
-    # Drop finished ones, and those that still run.
+    # Drop trainings that are finished or still running.
     unfinished = [attempt for attempt in trainings if not attempt.finished]
     idle = [attempt for attempt in unfinished if attempt.manifest.status != RUNNING]
     if unfinished and not idle:

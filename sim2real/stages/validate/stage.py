@@ -1,4 +1,4 @@
-"""Score an identification on later logs: for each joint the error, the expected error, and their ratio."""
+"""Scores an identification on later logs: for each joint the error, the expected error, and their ratio."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ from sim2real.stages.validate.config import ValidateConfig
 from sim2real.types import Json
 
 _FREE_RUN_S = 10.0
-"""Longest free run of an identification without an expected error of free runs [s]."""
+"""Longest free run, if the identification has no expected error of free runs [s]."""
 _LEAST_S = 0.2
 """Shortest prediction [s]."""
 _NEIGHBOURS = 4
-"""Models within the uncertainty whose free runs show whether one is a test."""
+"""Number of models within the uncertainty, whose free runs show whether a free run is a test."""
 _SHOWN = 12
-"""Rows that the console prints, those with the largest ratio; ``--json`` has all."""
+"""Number of rows that the console prints, with the largest ratio first; ``--json`` has all."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -57,8 +57,8 @@ class Validation(Shown):
         errors: For each log and each joint that moves there, ahead and in a free run; the largest ratio first.
         identified: The status of the identification.
         resting: Log -> joints that do not move in it.
-        unsteady: Log -> joints whose free run is not judged: parameters within their uncertainty move it by more than
-            the expected error, as those of a pendulum do that balances.
+        unsteady: Log -> joints whose free run is not judged, because parameters within their uncertainty change it by
+            more than the expected error, as for a balanced pendulum.
         refused: Log -> why it was not scored.
     """
 
@@ -109,7 +109,7 @@ class Validation(Shown):
         return facts | ({"not scored": ", ".join(self.refused)} if self.refused else {})
 
     def rows(self) -> ArtifactTable:
-        """Return a row for each error, with those of the baselines where windows are predicted."""
+        """Return a row for each error, with the errors of baselines if windows are predicted."""
         return compared_table(self.errors)
 
 
@@ -157,9 +157,9 @@ def run(config: ValidateConfig) -> bool:
 def _following(
     found: Validation, identification: Identification, robot: RecordedRobot, folder: Path, log: Sequence[str]
 ) -> str:
-    """Return the next command, or what to do where none follows."""
+    """Return the next command, or a sentence on what to do."""
     if found.exceeded or found.beaten:
-        # An identification from all logs covers the motion of the new ones.
+        # An identification from all logs covers the motion of the new logs.
         fitted = [os.path.relpath(folder.parent / source.path) for source in identification.logs]
         logs = tuple(dict.fromkeys([*fitted, *log]))
         again = command(robot, replace(defaults_of(robot).identify, log=logs), Path("runs"))
@@ -211,7 +211,7 @@ def score(
     model = measured_channels(robot.identifiable(fitting.max_delay_s), [log.episode for log in logs])
     models = models_of(identification, model)
     refused = dict(refused or {})
-    # Keep the logs that were not fitted, hold the model's signals and are long enough for a window.
+    # Keep the logs that were not fitted, have the model's signals, and are long enough for a window.
     good, lengths = [], []
     for log, fitted in zip(logs, was_fitted(identification, logs, model), strict=True):
         try:
@@ -229,7 +229,7 @@ def score(
     if not good:
         raise UsageError("; ".join(f"{path}: {reason}" for path, reason in refused.items()) or "no log was given")
 
-    # Predict windows of the horizon, and a free run of each log; a short log has shorter ones.
+    # Predict windows as long as the horizon, and a free run of each log; a short log has shorter windows.
     horizon_s = next((row.seconds for row in identification.held_out), fitting.horizon_s)
     run_s = max((e.seconds for e in identification.expected_error if e.free_run), default=_FREE_RUN_S)
     errors, unsteady, measured = list[ComparedError](), dict[str, list[str]](), positions(model, robot.units)
@@ -258,11 +258,11 @@ def score(
                         continue
                     found = replace(row, log=log.path.name, free_run=free_run, seconds=seconds[r], expected=expected)
                     errors.append(replace(found, as_good=(), baselines={}) if free_run else found)
-    # A joint that rests is not compared: "no motion" would always be best.
+    # Do not compare a resting joint: the baseline of standing still would always be best.
     moved = {(e.log, e.joint) for e in errors}
     resting = {log.path.name: [p.name for p in measured if (log.path.name, p.name) not in moved] for log in good}
     if not errors:
-        raise UsageError("no joint moves in this log, so it tests no parameter", hint="take a log of motion")
+        raise UsageError("no joint moves in this log, so it tests no parameter", hint="take a log with motion")
     ordered = tuple(sorted(errors, key=lambda e: -(e.ratio or 0.0)))
     resting = {log: joints for log, joints in resting.items() if joints}
     status = identification.verdict.status
@@ -282,7 +282,7 @@ def _neighbours(identification: Identification, values: Mapping[str, float]) -> 
 
 
 def _spread(columns: Mapping[str, np.ndarray], position: str, models: Mapping[str, object]) -> float:
-    """Return how far neighbours of the identified model move a joint, the largest root mean square; 0 without any."""
+    """Return how far neighbouring models move a joint from the identified model: the largest root mean square."""
     identified, *others = (columns[f"{position}_{name}"] for name in models)
     return max((float(np.sqrt(np.mean((other - identified) ** 2))) for other in others), default=0.0)
 
@@ -313,7 +313,7 @@ def _windows(
     free_run: bool,
     like: Problem | None,
 ) -> Problem:
-    """Return logs in segments without a fitted one; a free run is one segment a log.
+    """Return logs in held-out segments; for a free run, each log is one segment.
 
     Args:
         seconds: Length of the predictions of each log [s].
