@@ -15,7 +15,7 @@ def is_jax(value: object) -> bool:
 
 
 def namespace(*values: object) -> Any:
-    """Return ``jax.numpy`` when one of the values, or of their items, is JAX's; else ``numpy``."""
+    """Return ``jax.numpy`` if one of the values, or an item of one, is an array of JAX; else ``numpy``."""
     for value in values:
         items = value if isinstance(value, list | tuple) else (value,)
         if any(is_jax(v) for v in items):
@@ -26,7 +26,7 @@ def namespace(*values: object) -> Any:
 
 
 def beside_damping(armature: Scalar, damping: Scalar, step_s: Scalar) -> Any:
-    """Return the armature to set in a model of MuJoCo: the rotor's, without what its integrator adds; 0 at least.
+    """Return the armature to set in a MuJoCo model: the rotor's inertia minus what the integrator adds, at least 0.
 
     MuJoCo integrates damping implicitly, which acts like an inertia of half a step times the damping: at 2.5 ms that is
     6 % of the rotors' inertia of pipelines/arm, and 0.0018 kg m^2 for a damping of 1.4 N m s/rad.

@@ -1,4 +1,4 @@
-"""The command line: arguments in, a command called, an exit code out."""
+"""The command line: calls the command that the arguments name, and returns its exit code."""
 
 import contextlib
 import importlib
@@ -35,12 +35,12 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "demo": ("run the embedded pendulum, without a robot", "run.demo"),
     "play": ("a walking policy on a twin, in a window or as a video", "play.play"),
 }
-"""Command -> its line in the help, and its function below ``sim2real.commands``."""
+"""Command -> its line in the help, and its function in ``sim2real.commands``."""
 EXAMPLES = ("demo", "play")
 
 
 def help_text() -> str:
-    """Return what ``sim2real --help`` prints."""
+    """Return the text of ``sim2real --help``."""
     lines = {name: f"  {name:9} {text}" for name, (text, _) in COMMANDS.items()}
     commands = "\n".join(line for name, line in lines.items() if name not in EXAMPLES)
     examples = "\n".join(lines[name] for name in EXAMPLES)
@@ -87,7 +87,7 @@ def _run_command(arguments: list[str], signals: SignalHandling) -> int:
         sys.stdout.flush()
     except Sim2RealError as error:
         return _failed(error, arguments)
-    except BrokenPipeError:  # the reader of our output has closed it, as `head` does: no error
+    except BrokenPipeError:  # the reader of the output, such as `head`, has closed it: no error
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return ERROR
     except KeyboardInterrupt:
@@ -102,7 +102,7 @@ def _run_command(arguments: list[str], signals: SignalHandling) -> int:
         missing = not_installed(error)
         return _failed(missing, arguments) if missing else _unexpected(error)
     except Exception as error:
-        if signals.received:  # an extension that is interrupted while it is imported raises ImportError
+        if signals.received:  # an extension whose import is interrupted raises ImportError
             return _ended_by(signals.received)
         return _unexpected(error)
     return OK
@@ -139,7 +139,7 @@ def _dispatch(arguments: list[str]) -> None:
 def _failed(error: Sim2RealError, arguments: Sequence[str]) -> int:
     """Print the error's message, notes and hint; return its exit code."""
     _print_traceback()
-    # Notes name nodes, and what else failed during the clean-up; the hint comes last.
+    # Notes name nodes, and further failures during the clean-up; the hint comes last.
     command = f"{arguments[0]} " if arguments and arguments[0] in COMMANDS else ""
     hint = error.hint or (f"see `sim2real {command}--help`" if isinstance(error, UsageError) else None)
     _complain(f"error: {error.args[0]}", *_notes(error), *([f"\nhint: {hint}"] if hint else []))
@@ -164,14 +164,14 @@ def _unexpected(error: Exception) -> int:
         with tempfile.NamedTemporaryFile("w", prefix="sim2real-", suffix=".traceback.txt", delete=False) as file:
             file.write(traceback.format_exc())
             where = f"traceback in {file.name}"
-    except OSError:  # e.g. a full disk, which may be the exception itself
+    except OSError:  # e.g. the disk is full, which may be the exception itself
         where = f"{DEBUG}=1 shows the traceback"
     _complain(f"error: {type(error).__name__}: {reason} ({where})", *_notes(error))
     return ERROR
 
 
 def _ended_by(number: int) -> int:
-    """Print which signal ended the command; return the exit code."""
+    """Print the signal that ended the command; return the exit code."""
     _complain("interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}")
     return 128 + number
 
@@ -179,8 +179,8 @@ def _ended_by(number: int) -> int:
 def _leave(code: int) -> NoReturn:
     """End this process at once, without the interpreter's shutdown; for commands that ended early.
 
-    A compiled program that is still running in XLA's threads would make the interpreter's shutdown wait for it, or end
-    in a segmentation fault. Open logs are closed before: their status is ``aborted``.
+    If a compiled program still ran in XLA's threads, the interpreter's shutdown would wait for it, or end in a
+    segmentation fault. Open logs are closed before, with the status ``aborted``.
     """
     if writer := sys.modules.get("sim2real.log.writer"):
         writer.close_open_logs()

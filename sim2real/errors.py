@@ -17,7 +17,7 @@ exit codes
   1  error                       5  deadlines missed (with --strict-timing)
   2  wrong command or flag       130, 143  ended by Ctrl-C, by SIGTERM; the robot is switched off first
   3  safety stop"""
-"""The codes as the help of each command lists them."""
+"""The exit codes, for the help of each command."""
 
 
 class Sim2RealError(ValueError):
@@ -59,11 +59,11 @@ class SafetyStop(Sim2RealError):  # noqa: N818 - an event, not a mistake in the 
 
 
 class DelayChanged(SafetyStop):
-    """The robot's delay differs from that of its policy's training, and the policy moved no joint (exit code 3)."""
+    """The robot's delay differs from the delay in the policy's training; the policy moved no joint (exit code 3)."""
 
 
 class OtherMotion(Sim2RealError):  # noqa: N818
-    """A log is of a motion that the identified model does not describe, such as a walk beside a model in a stand."""
+    """A log has a motion that the identified model does not describe, such as a walk for a model in a stand."""
 
 
 class HardwareLost(Sim2RealError):  # noqa: N818

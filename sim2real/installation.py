@@ -1,4 +1,4 @@
-"""Which distribution is installed: ``sim2real`` with everything, or ``sim2real-robot`` for a robot's computer."""
+"""The installed distribution: ``sim2real`` with everything, or ``sim2real-robot`` for a robot's computer."""
 
 import functools
 import importlib.util
@@ -32,7 +32,8 @@ def has_jax() -> bool:
 def with_extra(extra: str) -> str:
     """Return the command that installs the packages of an extra.
 
-    It names these packages, not this distribution, whose name is not registered on any index: a stranger may take it.
+    The command has these packages, and not this distribution: its name is not registered on any index, so a stranger
+    may take it.
     """
     from importlib import metadata
 
@@ -42,10 +43,10 @@ def with_extra(extra: str) -> str:
 
 
 def require_one(folder: Path = Path(__file__).parents[1]) -> None:
-    """Refuse two distributions in one folder: their files are the same, and the second has replaced those of the first.
+    """Refuse two distributions in one folder: the second has replaced files of the first.
 
     Raises:
-        UsageError: Both are there.
+        UsageError: Both are installed.
     """
     files = os.listdir(folder)
     prefixes = [f"{name.replace('-', '_')}-" for name in (WHOLE, ROBOT)]

@@ -1,4 +1,4 @@
-"""How far a joint can have moved between two readings: the rule that a robot is stopped by, and a file is read with."""
+"""How far a joint can have moved between two readings; used to stop a robot, and to check an imported file."""
 
 import numpy as np
 

@@ -1,8 +1,8 @@
 """Trees of arrays: messages, states and parameters.
 
-``@pytree.dataclass`` makes a frozen dataclass of arrays, with ``replace``, as ``flax.struct.dataclass`` does; those of
-flax work beside it. Where JAX is installed the classes are registered with it and the functions are JAX's; elsewhere
-they are plain ones, with JAX's leaves in JAX's order.
+``@pytree.dataclass`` makes a frozen dataclass of arrays, with ``replace``, like ``flax.struct.dataclass``, whose
+classes also work here. If JAX is installed, the classes are registered with it, and the functions are JAX's; otherwise
+functions in Python give the same leaves in the same order.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ LEAVES = "_leaves_of_tree"
 
 
 def field(pytree_node: bool = True, **options: PyTree) -> PyTree:
-    """Return a field of a dataclass; ``pytree_node=False``: a constant of the tree, without leaves."""
+    """Return a field of a dataclass; with ``pytree_node=False``, a constant of the tree without leaves."""
     return dataclasses.field(metadata={"pytree_node": pytree_node}, **options)
 
 
@@ -40,7 +40,7 @@ def dataclass(cls: type[T]) -> type[T]:
 
 
 Path = tuple[str | int, ...]
-"""Keys on the way to a leaf."""
+"""Keys from the root to a leaf."""
 
 
 class Structure(NamedTuple):
@@ -49,7 +49,7 @@ class Structure(NamedTuple):
     Attributes:
         kind: Type of the node; None: a leaf.
         keys: Names or numbers of the parts.
-        constants: Names and values of the fields that are no parts.
+        constants: Names and values of the fields that are constants.
     """
 
     kind: type | None
@@ -78,7 +78,7 @@ def plain_flatten(tree: PyTree) -> tuple[list[PyTree], Structure]:
 
 
 def plain_flatten_with_path(tree: PyTree) -> tuple[list[tuple[Path, PyTree]], Structure]:
-    """Return the leaves of a tree with their keys on the way, and the tree's structure."""
+    """Return the leaves of a tree with their paths, and the tree's structure."""
     entries: list[tuple[Path, PyTree]] = []
     return entries, _walk(tree, (), entries)
 

@@ -1,13 +1,13 @@
-"""Aliases of types, for annotations. Imports JAX and MuJoCo for type checkers alone."""
+"""Aliases of types, for annotations. Imports JAX and MuJoCo only for type checkers."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 PyTree: TypeAlias = Any
-"""A tree of arrays, as JAX maps over it: a message, a state, parameters."""
+"""A tree of arrays (a pytree of JAX): a message, a state, parameters."""
 Json: TypeAlias = Any
-"""A value as ``json`` reads it: a number, a text, a list or a dict of such values, or None."""
+"""A value of JSON: a number, a text, a boolean, a list or dict of such values, or None."""
 
 if TYPE_CHECKING:
     import jax

@@ -1,1 +1,1 @@
-"""Why does a policy work in simulation and fail on the robot: contract, timing, plant, or none of these."""
+"""Finds out why a policy works in simulation and fails on the robot: contract, timing, plant, or none of these."""

@@ -1,4 +1,4 @@
-"""Before the robot moves: what the policy and the model alone say about what may fail."""
+"""Examines a policy before the robot moves, with the policy and the model alone."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _UPRIGHT, _FAST_RAD_S = 0.5, 3.0
 
 @dataclass(frozen=True)
 class Run:
-    """A policy in the model: whether it stayed up, the rms speed of its joints, and shares of limited commands."""
+    """Result of a policy in the model: whether it stayed up, rms speed of joints, shares of limited commands."""
 
     up: bool
     until_s: float
@@ -37,13 +37,13 @@ class Run:
 
 
 def examine(policy: Policy, drives: Drives) -> dict[str, Any]:
-    """Return what may fail: numbers that are none, unmeasured entries, and what the policy stands in the model."""
+    """Return what may fail: actions that are not finite, unmeasured entries, and disturbances that make it fall."""
     c, lines, rng = policy.contract, list[str](), np.random.default_rng(0)
     finite = all(np.isfinite(policy(scale * rng.normal(size=(256, c.size)))).all() for scale in _LARGE)
     if not finite:
         lines.append("the network gives numbers that are not finite for large observations")
 
-    # Entries that no robot measures.
+    # Entries of the observation that no robot measures.
     unmeasured: dict[str, float] = {}
     usual = 0.3 * rng.normal(size=(256, c.size))
     for term, lag in c.layout:
@@ -56,7 +56,7 @@ def examine(policy: Policy, drives: Drives) -> dict[str, Any]:
     lines += [f"the action depends on {name}, which a robot's sensors do not give: 0.5 of it changes the actions by "
               f"{change:.0%} of their deviation" for name, change in unmeasured.items() if change > 0.02]  # fmt: skip
 
-    # The policy in the model, as trained and with what a robot may have.
+    # The policy in the model, as in training and with disturbances of a real robot.
     nominal = _run(policy, drives, Setting())
     limit = max(3.0 * nominal.speed, _FAST_RAD_S)
     runs = {name: _run(policy, drives, plant) for name, plant in {**_DELAYS, **_PLANTS}.items()}
@@ -85,9 +85,9 @@ def examine(policy: Policy, drives: Drives) -> dict[str, Any]:
 
 
 def _run(policy: Policy, drives: Drives, plant: Setting, start: np.random.Generator | None = None) -> Run:
-    """Let the policy act in the model, with the command 0; ``start`` draws another start."""
+    """Let the policy act in the model, with the command 0; ``start``: random numbers for another start."""
     c, d = policy.contract, drives
-    model = d.with_plant(plant, np.minimum(d.limit, d.kp))  # the largest torque: by the model, or for 1 rad
+    model = d.with_plant(plant, np.minimum(d.limit, d.kp))  # the largest torque: the model's, or the torque for 1 rad
     data = mujoco.MjData(model)
     default = c.per_joint("default_joint_pos")
     spread = (0.0, 0.0) if start is None else (_POSE_RAD, _TILT_RAD)
@@ -120,7 +120,7 @@ def _run(policy: Policy, drives: Drives, plant: Setting, start: np.random.Genera
             rows = [past[0]] * (longest + 1 - len(past)) + list(past)
             q, dq, quats, gyros, actions = (np.array(column) for column in zip(*rows, strict=True))
             times, count = np.arange(len(rows)) / c.rate_hz, len(rows)
-            # The newest row's own action does not exist yet: its last action is that of the row before.
+            # The newest row has no action yet: its last action is the action of the row before.
             log = Log(times, times, q, dq, quats, gyros, np.zeros((count, 3)), np.zeros((count, size)), None,
                       np.roll(actions, -1, 0))  # fmt: skip
             deployed = Deployed(log, policy)

@@ -1,4 +1,4 @@
-"""What a policy of any trainer expects of its robot: read from its export, and asked for where the export is silent."""
+"""The contract of a policy of any trainer: read from its export; the user is asked for missing facts."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ KINDS: Mapping[str, str] = {
     "cos_joint_pos": "cos_joint_pos cos",
     "phase": "gait_phase phase",
 }
-"""Kind of an observation term -> its names in the exports of trainers."""
+"""Kind of an observation term -> its names in exports of trainers."""
 UNMEASURED = ("lin_vel", "other")
-"""Kinds that the sensors of a robot alone do not give."""
+"""Kinds of terms that do not come from sensors."""
 _OF_NAME = {name: kind for kind, names in KINDS.items() for name in names.split()}
 _OPEN = re.compile(r"^#\s*([a-z_]+) = .*\?", re.MULTILINE)
 _QUESTIONS = {
@@ -46,16 +46,17 @@ _QUESTIONS = {
     "observation": 'which terms has the observation, such as [[observation]] term = "joint_pos"?',
 }
 Numbers = float | tuple[float, ...] | dict[str, float]
-"""One number, one for each joint, or one for each pattern of joints' names, as Isaac Lab has them."""
+"""One number, a number for each joint, or a number for each pattern of joint names, as in Isaac Lab."""
 
 
 class Term(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """A term of the observation.
 
     Attributes:
-        term: Its kind in ``KINDS``, or one of the names there; other names are read from a logged observation only.
-        size: Number of entries of one step; 0: as the kind has it.
-        scale: The network gets this multiple of the quantity.
+        term: A kind of ``KINDS``, or one of its names; terms with other names can only be read from logged
+            observations.
+        size: Number of entries of one step; 0: the kind's usual number.
+        scale: Factor from the quantity to the network's input.
         history: Number of steps in the observation.
         relative: Whether ``joint_pos`` counts from ``default_joint_pos``.
     """
@@ -68,7 +69,7 @@ class Term(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_default
 
     @property
     def kind(self) -> str:
-        """Its kind in ``KINDS``; ``other`` if none has its name."""
+        """The kind in ``KINDS``; ``other`` if no kind has the name."""
         return _OF_NAME.get(re.sub(r"[^a-z0-9]+", "_", self.term.lower()).strip("_"), "other")
 
 
@@ -76,12 +77,13 @@ class Contract(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
     """What a policy expects of its robot.
 
     Attributes:
-        joints: Names in the model, in the network's order.
+        joints: Names of the joints in the model, in the network's order.
         default_joint_pos: Shape ``(J,)`` [rad].
         action_scale: A target is ``default_joint_pos + action_scale * action`` [rad].
         kp, kd: Gains of the drives in training [N m/rad], [N m s/rad].
-        drive: What a target is: an angle for drives with gains, or a joint torque, ``action_scale * action`` [N m].
-        delay_s: Longest time from a measurement to the motion that answers it, in training; None: unknown, taken as 0.
+        drive: Kind of target: ``position`` for drives with gains, or ``torque``, ``action_scale * action`` [N m].
+        delay_s: Longest time from a measurement to the motion that answers it, in training [s]; None: unknown, taken as
+            0.
         mean, std, clip: Normaliser outside of the network: ``clip((observation - mean) / std)``; empty: none.
     """
 
@@ -101,12 +103,12 @@ class Contract(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
     clip: float = 1e9
 
     def per_joint(self, name: str) -> np.ndarray:
-        """Return one of the settings with a number for each joint, ``(J,)``."""
+        """Return a setting as a number for each joint, ``(J,)``."""
         setting = getattr(self, name)
         if isinstance(setting, dict):
             matched = [[v for p, v in setting.items() if re.fullmatch(p, joint)] for joint in self.joints]
             if bare := [joint for joint, found in zip(self.joints, matched, strict=True) if len(found) != 1]:
-                raise UsageError(f"the patterns of {name} match joint {bare[0]} not once")
+                raise UsageError(f"no pattern of {name} matches joint {bare[0]}")
             return np.array([found[0] for found in matched], float)
         value = np.asarray(setting, float)
         if value.size not in (1, len(self.joints)):
@@ -129,7 +131,7 @@ class Contract(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
         return [(i, lag) for i, term in terms for lag in lags if lag < term.history]
 
     def block(self, term: int, lag: int) -> slice:
-        """Return where the observation has a term of some steps ago."""
+        """Return the slice of the observation with a term of ``lag`` steps ago."""
         at = self.layout.index((term, lag))
         begin = sum(self.size_of(self.observation[t]) for t, _ in self.layout[:at])
         return slice(begin, begin + self.size_of(self.observation[term]))
@@ -155,7 +157,7 @@ class Policy:
         if len(inputs) != 1:
             names = ", ".join(i.name for i in inputs)
             raise UsageError(
-                f"the network has {len(inputs)} inputs: {names}; the doctor reads networks with the observation alone",
+                f"the network has {len(inputs)} inputs: {names}; the only input must be the observation",
                 hint="export the actor without its memory or time step, as a function of the observation",
             )
         self._input, self._output = inputs[0].name, output.name
@@ -174,17 +176,17 @@ class Policy:
         return self.network(self.normalised(observations))
 
     def normalised(self, observations: np.ndarray) -> np.ndarray:
-        """Return observations as the network takes them."""
+        """Return the network's input for observations."""
         c = self.contract
         return np.clip((observations - np.array(c.mean)) / np.array(c.std), -c.clip, c.clip) if c.mean else observations
 
     def network(self, x: np.ndarray) -> np.ndarray:
-        """Return the network's output ``(N, A)``, float64, for what it takes ``(N, O)``."""
+        """Return the network's output ``(N, A)``, float64, for normalised observations ``(N, O)``."""
         rows = np.ascontiguousarray(x, np.float32)
         run = lambda value: self._session.run([self._output], {self._input: value})[0]  # noqa: E731
         try:
             return np.asarray(run(rows), float).reshape(len(rows), -1)
-        except Exception:  # a network that reshapes to one row
+        except Exception:  # the network reshapes its input to one row
             return np.asarray([run(row[None]) for row in rows], float).reshape(len(rows), -1)
 
 
@@ -203,7 +205,7 @@ def _batched(content: bytes) -> bytes:
 def write_bundle(folder: Path, policy: Policy) -> Path:
     """Write a policy of any trainer as a bundle, with its normaliser in the network; return the folder.
 
-    The bundle's actions are those of the network, in its units and order, within bounds of 100.
+    The bundle's actions are the network's, in its units and order, with bounds of 100.
     """
     import onnx
     from onnx import helper, numpy_helper
@@ -242,7 +244,7 @@ def write_bundle(folder: Path, policy: Policy) -> Path:
 
 
 _BOUND = 100.0
-"""Largest action of a bundle of another trainer, whose networks state none."""
+"""Bound of the actions of a bundle from another trainer, whose networks state none."""
 
 
 # -- reading
@@ -251,7 +253,7 @@ _BOUND = 100.0
 def read_policy(
     policy: Path, description: Path | None = None, model_joints: Sequence[str] = (), out: Path = Path()
 ) -> Policy:
-    """Read a policy and all that is said about it.
+    """Read a policy and all available facts about it.
 
     Args:
         policy: An ONNX file, or the folder of a bundle.
@@ -260,14 +262,15 @@ def read_policy(
         out: Folder of the contract file with questions.
 
     Raises:
-        UsageError: A file cannot be read, or something is not said; a contract file with questions is written.
+        UsageError: A file cannot be read, or facts are missing: then a contract file with questions is written.
     """
     content, facts = _read_export(policy)
     if description is not None:
         facts |= _read_description(description, model_joints)
     questions = {name: text for name, text in _QUESTIONS.items() if name not in facts}
     for name in ("kp", "kd"):
-        # The model may have gains, and a torque needs none; what an exporter has put there is asked again.
+        # Do not ask for gains if the model has them or targets are torques; ask again if an exporter wrote
+        # placeholders.
         why = _no_gain(name, facts[name]) if name in facts else ""
         if why:
             del facts[name]
@@ -279,7 +282,7 @@ def read_policy(
         path = out / FILE
         path.write_text(contract_toml(facts, questions), encoding="utf-8")
         raise UsageError(
-            f"{policy} does not say everything; {path} has {len(questions)} open questions:\n"
+            f"facts about {policy} are missing; {path} has {len(questions)} open questions:\n"
             + "\n".join(f"  {name}: {text}" for name, text in questions.items()),
             hint=f"answer them in the file, and repeat the command with --contract {path}",
         )
@@ -298,7 +301,7 @@ def _no_gain(name: str, given: Json) -> str:
     try:
         numbers = np.atleast_1d(list(given.values()) if isinstance(given, dict) else given).astype(float)
     except (TypeError, ValueError):
-        return ""  # the contract's types refuse it
+        return ""  # refused later by the contract's types
     if not numbers.size:
         return ""
     if (np.abs(numbers) < 5e-4).all() or (name == "kp" and (np.abs(numbers - 1.0) < 5e-4).all()):
@@ -307,7 +310,7 @@ def _no_gain(name: str, given: Json) -> str:
 
 
 def contract_toml(contract: Contract | Mapping[str, Json], questions: Mapping[str, str] = MappingProxyType({})) -> str:
-    """Return a contract, or what is known of one, as a file with a comment for each open question."""
+    """Return a contract, or its known part, as TOML with a comment for each open question."""
     facts = msgspec.to_builtins(contract)
     lines = [f"# {name} = {text}" for name, text in questions.items()]
     for key, value in facts.items():
@@ -330,7 +333,7 @@ def _read_export(policy: Path) -> tuple[bytes, dict[str, Json]]:
         terms = [{"term": t.name, "size": t.size, "history": t.history} for t in bundle.observation]
         earlier = [t for t in terms if t["term"].startswith("earlier features")]
         terms = [t for t in terms if t not in earlier]
-        for term in terms if earlier else ():  # a walking policy remembers all its features but the command
+        for term in terms if earlier else ():  # a walking policy's history has all features except the command
             term["history"] += earlier[0]["history"] * (not term["term"].startswith("command"))
         facts: dict[str, Json] = {
             "rate_hz": bundle.rate_hz, "observation": terms, "history_order": "newest first",
@@ -346,7 +349,7 @@ def _read_export(policy: Path) -> tuple[bytes, dict[str, Json]]:
         model = onnx.load_from_string(content)
     except OSError as error:
         raise UsageError(f"the policy {policy} cannot be read: {error.strerror}") from None
-    except Exception:  # protobuf's errors share no base class
+    except Exception:  # errors of protobuf have no common base class
         raise UsageError(
             f"{policy} is no ONNX file",
             hint="export the actor as ONNX: torch.onnx.export for Stable-Baselines3 and rsl_rl, jax2onnx for brax",
@@ -385,7 +388,7 @@ def _facts_of_metadata(data: Mapping[str, str]) -> dict[str, Json]:
 
 
 def _term(name: str, given: Mapping[str, Json]) -> dict[str, Json]:
-    """Return a term of the observation, of what a trainer says about it."""
+    """Return a term of the observation from a trainer's description."""
     scale, term = given.get("scale"), dict[str, Json](term=name)
     if scale is not None:
         term["scale"] = scale if isinstance(scale, list) else float(scale)
@@ -397,7 +400,7 @@ def _term(name: str, given: Mapping[str, Json]) -> dict[str, Json]:
 def _with_rate(facts: dict[str, Json]) -> dict[str, Json]:
     if "period" in facts:
         period_s = float(facts.pop("period"))
-        facts["rate_hz"] = 1.0 / period_s if period_s > 0 else 0.0  # which is refused
+        facts["rate_hz"] = 1.0 / period_s if period_s > 0 else 0.0  # refused later
     return facts
 
 
@@ -410,11 +413,11 @@ _YAML = {
     "decimation": {"period": "sim.dt", "default_joint_pos": "scene.robot.init_state.joint_pos",
                    "action_scale": "actions.*.scale"},  # Isaac Lab
 }  # fmt: skip
-"""Key that tells a format -> where its facts stand: the first path that is there counts."""
+"""Key that identifies a format -> fact -> paths in the file; the first existing path counts."""
 
 
 def _at(data: Json, paths: str) -> Json:
-    """Return what stands at the first of some paths ``a.b|c``; ``*`` is the first entry that has what follows."""
+    """Return the value at the first existing path of ``a.b|c``; ``*``: the first entry with the rest."""
     for path in paths.split("|"):
         found: list[Json] = [data]
         for key in path.split("."):
@@ -432,7 +435,7 @@ def _facts_of_yaml(data: Mapping[str, Json], model_joints: Sequence[str]) -> dic
     motors = [int(m) for m in (range(motors) if isinstance(motors, int) else motors)]
     if motors and max(motors) < len(model_joints):
         facts["joints"] = [model_joints[m] for m in motors]
-    if form == "step_dt":  # gains stand in the order of the motors, and positions in the network's
+    if form == "step_dt":  # gains are in the order of the motors, positions in the network's order
         facts |= {name: [float(facts[name][m]) for m in motors] for name in ("kp", "kd")}
         terms = data["observations"]
     elif form == "control_dt":
@@ -441,7 +444,7 @@ def _facts_of_yaml(data: Mapping[str, Json], model_joints: Sequence[str]) -> dic
         terms: dict[str, Json] = {term: {"scale": data[key]} if key else {} for term, key in scales.items()}
         if (phase := int(data["num_obs"]) - 9 - 3 * int(data["num_actions"])) > 0:
             terms["phase"] = {"size": phase}
-    else:  # the order of the joints is the simulator's, which the file does not have: it is asked
+    else:  # the order of the joints is the simulator's and not in the file: ask for it
         facts["period"] = float(facts["period"]) * int(data["decimation"])
         group = data["observations"]["policy"]
         shared = {} if group.get("history_length") is None else {"history_length": group["history_length"]}
@@ -476,7 +479,7 @@ def _read_description(path: Path, model_joints: Sequence[str]) -> dict[str, Json
         return facts
     import yaml
 
-    loader = type("Loader", (yaml.SafeLoader,), {})  # Isaac Lab's files have tags of Python's own types
+    loader = type("Loader", (yaml.SafeLoader,), {})  # Isaac Lab's files have tags of Python types
     loader.add_multi_constructor("tag:yaml.org,2002:python/", _plain_node)
     try:
         data = yaml.load(text, loader)
@@ -490,7 +493,7 @@ def _read_description(path: Path, model_joints: Sequence[str]) -> dict[str, Json
     try:
         return _facts_of_yaml(data, model_joints)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-        raise UsageError(f"{path} lacks a part of its format, or has it in another form: {error!r}") from None
+        raise UsageError(f"{path} is malformed: {error!r}") from None
 
 
 def _plain_node(loader: Any, suffix: str, node: Any) -> Json:

@@ -1,23 +1,24 @@
-"""What a deployment makes of measurements and actions: observations and targets, for any way of making them.
+"""Computes the observations and targets of a deployment from measurements and actions, with or without faults.
 
-A way is a ``Setting``, of what differs from the contract:
+The faults are a ``Setting``: names of differences from the contract:
 
-- a kind of a term, ``action_scale``: factor beside the contract's scale
-- ``degrees KIND``: whether the joints' angles or rates are in degrees before the pose is taken off
+- a kind of a term, ``action_scale``: additional factor to the contract's scale
+- ``degrees KIND``: whether the joints' angles or rates are in degrees, before the default pose is subtracted
 - ``order SIDE``: entry i of the policy is joint ``order[i]`` of the contract; sides: ``seen``, ``moved``
-- ``signs SIDE``, ``turned SIDE``: signs of the entries: of the distance from the default pose, of the angle itself
-- ``pose SIDE``: what the default pose has too much [rad]
+- ``signs SIDE``, ``turned SIDE``: signs of the entries: of the angle minus the default pose; of the angle itself
+- ``pose SIDE``: error of the default pose [rad]
 - ``frame KIND``: a key of ``FRAMES``, or the signed axes of a vector, such as ``(2, 1, -3)``
-- ``late``: age of the measurements beyond the newest in the log [s]
+- ``late``: additional age of the measurements [s]
 - ``stale``: steps by which a whole observation is older
-- ``frozen``: share of the log after which gyro and gravity in the observation do not change
-- ``stuck``: (joint, share): after which a joint in the observation does not change
-- ``history``: ``reversed``, ``layout``: by step and not by term, or the reverse; ``newest`` in all places
+- ``frozen``: share of the log after which gyro and gravity in the observation stay constant
+- ``stuck``: (joint, share of the log): after it, a joint in the observation stays constant
+- ``history``: ``reversed``; ``layout``: ordered by step instead of by term, or the reverse; ``newest``: the newest step
+  everywhere
 - ``terms``: term i of the observation is term ``terms[i]`` of the contract
-- ``last_action is``: ``older``: that of the step before; ``target``: after scale and pose
+- ``last_action is``: ``older``: the action of the step before; ``target``: the action after scale and pose
 - ``clipped``: whether actions end at the logged range
-- ``normalised``: how often the normaliser is applied
-- ``gain``, ``bias``: of each entry of the observation: another normaliser
+- ``normalised``: number of times that the normaliser is applied
+- ``gain``, ``bias``: gain and bias of each entry of the observation, as by another normaliser
 """
 
 from __future__ import annotations
@@ -47,11 +48,11 @@ FRAMES: dict[str, tuple[str, Callable[[np.ndarray, np.ndarray], np.ndarray]]] = 
     "w first": ("made of a quaternion x, y, z, w that is read as w, x, y, z",
                 lambda quat, v: _back(matrices(np.roll(quat, -1, 1)), _turned(matrices(quat), v))),
 }  # fmt: skip
-"""Wrong frame -> what it is in words, and the vector that a deployment has of quaternions and vectors in the body."""
+"""Wrong frame -> description, and function of quaternions and vectors in the body that gives the wrong vector."""
 
 
 class Deployed:
-    """A log beside its policy: observations, actions and targets for any way of making them."""
+    """A log with its policy: computes observations, actions and targets, with or without faults."""
 
     def __init__(self, log: Log, policy: Policy) -> None:
         self.log, self.policy, self.contract = log, policy, policy.contract
@@ -74,7 +75,7 @@ class Deployed:
         return self._states[late_s]
 
     def quantities(self, how: Setting) -> dict[str, np.ndarray]:
-        """Return the newest entries of each kind at each step ``(N, size)``, before the contract's scale."""
+        """Return for each kind its newest entries at each step ``(N, size)``, before the contract's scale."""
         state, count = self._state(how.get("late", 0.0)), len(self.log.t)
         if "frozen" in how:
             held = np.minimum(np.arange(count), int(how.get("frozen") * count))
@@ -106,14 +107,14 @@ class Deployed:
         return {kind: values * how.get(kind) for kind, values in made.items()}
 
     def actions(self, how: Setting) -> np.ndarray | None:
-        """Return the network's actions ``(N, A)``: the logged ones, or those that the targets say."""
+        """Return the network's actions ``(N, A)``: as logged, or computed back from the targets."""
         if self.log.action is not None or self.log.target is None:
             return self.log.action
         rest = self._resting + np.array(how.get("pose moved", 0.0))
         return _taken(how, "moved", self.log.target, rest) / (self._scale * how.get("action_scale"))
 
     def targets(self, how: Setting, action: np.ndarray) -> np.ndarray:
-        """Return the targets ``(N, J)`` that actions ``(N, A)`` give."""
+        """Return the targets ``(N, J)`` for actions ``(N, A)``."""
         signs, turned = np.array(how.get("signs moved")), np.array(how.get("turned moved"))
         rest = self._resting + np.array(how.get("pose moved", 0.0))
         placed = np.empty_like(action)
@@ -146,7 +147,7 @@ class Deployed:
 
     @cached_property
     def logged(self) -> np.ndarray | None:
-        """The logged observations as before the normaliser ``(N, O)``; a log may have them from behind it."""
+        """The logged observations before the normaliser ``(N, O)``; the log may have normalised ones."""
         obs, c = self.log.obs, self.contract
         if obs is None or not c.mean or obs.shape[1] != c.size:
             return obs
@@ -157,29 +158,29 @@ class Deployed:
 
     @cached_property
     def acted(self) -> np.ndarray:
-        """The logged actions, or the network's on the logged observations ``(N, A)``."""
+        """The logged actions ``(N, A)``, or the network's actions for the logged observations."""
         return self.log.action if self.log.action is not None else self.policy(known(self.logged))
 
 
 def _taken(how: Setting, side: str, robot: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """Return the policy's entries less the pose for the robot's ``(N, J)``; the inverse of ``Deployed.targets``."""
+    """Return the policy's entries, without the pose, for the robot's joints ``(N, J)``; inverse of ``targets``."""
     signs, order = np.array(how.get(f"signs {side}")), list(how.get(f"order {side}", ())) or slice(None)
     return robot[:, order] * signs * np.array(how.get(f"turned {side}")) - rest * signs
 
 
 def known(values: np.ndarray | None) -> np.ndarray:
-    """Return values that the caller knows to be there."""
+    """Return values that the caller knows to exist."""
     assert values is not None
     return values
 
 
 def matrices(quat: np.ndarray) -> np.ndarray:
-    """Return rotations from the body to the world ``(N, 3, 3)`` of quaternions w, x, y, z."""
+    """Return rotation matrices from the body to the world ``(N, 3, 3)`` for quaternions w, x, y, z."""
     return Rotation.from_quat(quat, scalar_first=True).as_matrix()
 
 
 def in_frame(change: Any, quat: np.ndarray | None, body: np.ndarray) -> np.ndarray:
-    """Return vectors of the body ``(N, 3)``, as a deployment with a wrong frame or wrong axes has them."""
+    """Return vectors of the body ``(N, 3)`` in a wrong frame or with wrong axes."""
     if isinstance(change, str):
         return FRAMES[change][1](known(quat), body)
     axes = np.array(change)

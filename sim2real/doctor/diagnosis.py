@@ -1,4 +1,4 @@
-"""All questions about one deployment, cheap ones first, with that of timing, and the sentence that answers them."""
+"""The diagnosis of a deployment: checks contract, timing and plant, and states the result in a sentence."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from sim2real.doctor.solve import solve_contract
 from sim2real.errors import UsageError
 
 _UNEXPLAINED = 0.45
-"""A replay whose error stays above this share of the joints' motion has a cause that no question names."""
+"""If the replay's error stays above this share of the joints' motion, an unknown fault remains."""
 
 _RATE_BAND, _JITTER, _LOST, _OLDER_S = 0.04, 0.25, 0.02, 0.015
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What is wrong with a deployment.
+    """The faults of a deployment.
 
     Attributes:
-        findings: The largest share of its gap first, contract before timing before plant.
-        figures: Question -> its figures.
-        skipped: Question -> why it was not asked.
+        findings: Contract before timing before plant; the largest share of the gap first.
+        figures: ``contract``, ``timing`` or ``plant`` -> figures.
+        skipped: ``contract``, ``timing`` or ``plant`` -> why it was not checked.
     """
 
     findings: tuple[Finding, ...]
@@ -38,17 +38,17 @@ class Diagnosis:
 
     @property
     def faults(self) -> list[str]:
-        """The names of what is wrong, each once."""
+        """The names of the faults, each once."""
         return list(dict.fromkeys(f.fault for f in self.findings))
 
     @property
     def unexplained(self) -> bool:
-        """Whether model and robot part, and no question says why."""
+        """Whether the model differs from the robot for no known reason."""
         return not self.findings and self.figures.get("plant", {}).get("error_fitted", 0.0) > _UNEXPLAINED
 
     @property
     def sentence(self) -> str:
-        """The answer in one sentence."""
+        """The diagnosis in one sentence."""
         if self.findings:
             first, more = self.findings[0], len(self.faults) - 1
             also = f", and {more} more" if more else ""
@@ -67,11 +67,11 @@ class Diagnosis:
 
 def diagnose(policy: Policy, log: Log, drives: Drives | None = None, sim: Log | None = None,
              robot_joints: tuple[str, ...] = ()) -> Diagnosis:  # fmt: skip
-    """Ask the three questions.
+    """Check contract, timing and plant.
 
     Args:
-        drives: The model; None: the plant is not asked.
-        sim: The log of a simulation, whose rate, ages and delay count as those of the training.
+        drives: The model; None: the plant is not checked.
+        sim: The log of a simulation, whose rate, ages and delay stand for those of the training.
     """
     contract = policy.contract
     found, errors = solve_contract(log, policy, robot_joints)
@@ -95,7 +95,7 @@ def diagnose(policy: Policy, log: Log, drives: Drives | None = None, sim: Log | 
                 skipped[f"the motion of {shortened(drives.still)}"] = "no action moves it, so the replay holds it still"
         except UsageError as error:
             skipped["plant"] = str(error.args[0])
-    # One line for each fault and question.
+    # Keep one finding for each fault and question.
     best: dict[tuple[str, str], Finding] = {}
     for finding in findings:
         best.setdefault((finding.fault, finding.question), finding)
@@ -105,10 +105,10 @@ def diagnose(policy: Policy, log: Log, drives: Drives | None = None, sim: Log | 
 
 
 def solve_timing(log: Log, contract: Contract, sim: Log | None = None) -> tuple[list[Finding], dict[str, float]]:
-    """Return what is wrong with the times of the policy's steps, and their figures [Hz, s].
+    """Return the faults of the timing of the policy's steps, and figures [Hz, s].
 
     Args:
-        sim: The log of a simulation, whose rate and ages count as those of the training.
+        sim: The log of a simulation, whose rate and ages stand for those of the training.
     """
     steps = np.diff(log.t)
     period = float(np.median(steps) if log.grain_s == 0.0 else np.mean(steps[steps < 1.6 * np.median(steps)]))

@@ -1,4 +1,4 @@
-"""A deployment's log as arrays: what was measured, what the policy saw and gave, and what was commanded."""
+"""A deployment's log as arrays: measurements, observations, actions and commands."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _VECTORS = {
     "obs": "observation obs observations",
     "action": "action actions raw_action network_action",
 }
-"""Signal without joints -> its names in a file; those of joints have the meanings of an import."""
+"""Signal without joints -> its names in a file; names of joint signals are read as in an import."""
 _OF_NAME = {name: signal for signal, names in _VECTORS.items() for name in names.split()}
 _ENTRIES = ["w", "x", "y", "z", "linear.x", "linear.y", "angular.z"]
 
@@ -43,8 +43,8 @@ class Log:
         obs: Observations before normalising ``(N, O)``.
         action: Outputs of the network ``(N, A)``.
         target: Commands to the drives ``(N, J)``, in the contract's order.
-        message_age_s: Ages of the measurements that the steps answer, if the log has the messages [s].
-        grain_s: How late the times of the steps may be, as a recorder with a clock of its own has seen them [s].
+        message_age_s: Ages of the measurements that the steps used, if the log has the messages [s].
+        grain_s: How late the times of the steps may be, if a separate recorder stamped them [s].
     """
 
     t: np.ndarray
@@ -68,13 +68,13 @@ class Log:
 
     @cached_property
     def age_s(self) -> np.ndarray | None:
-        """Ages of the measurements that the steps answer [s]: by the messages, or of the newest ones."""
+        """Ages of the measurements that the steps used [s]: from the messages, or assuming the newest ones."""
         if self.message_age_s is not None or self.rows_are_steps:
             return self.message_age_s
         return self.t - self.state_t[newest(self.state_t, self.t)]
 
     def at_steps(self, name: str, lag_s: float = 0.0) -> np.ndarray:
-        """Return a measured signal at the policy's steps, ``lag_s`` earlier; between measurements the older counts."""
+        """Return a measured signal ``lag_s`` before the policy's steps; between measurements, the older one."""
         values = getattr(self, name)
         if self.rows_are_steps:
             rows = np.arange(len(self.t), dtype=float) - lag_s / max(np.median(np.diff(self.t)), 1e-6)
@@ -93,7 +93,7 @@ class Log:
 
 
 def newest(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Return the row that is newest at each of some times."""
+    """Return for each wanted time the newest row."""
     return np.clip(np.searchsorted(times, wanted + 1e-6, side="right") - 1, 0, len(times) - 1)
 
 
@@ -103,12 +103,12 @@ def read_deployment(
     """Read a log of this project, or a CSV, NPZ, JSON or bag.
 
     Args:
-        joints: The joints of the contract, which are sought in the names of the columns.
+        joints: The joints of the contract, by which columns are found.
         robot_joints: The joints in the order of columns without names; default: the contract's.
-        drive: The contract's: whether targets are angles or torques.
+        drive: Kind of targets in the contract: angles or torques.
 
     Raises:
-        UsageError: The file cannot be read, has no times, positions or commands, or names that fit no joint.
+        UsageError: The file cannot be read, lacks times, positions or commands, or has names that match no joint.
     """
     table, age_s = _own_table(path) if path.is_file() and bags.is_ours(path) else (open_tables(path)[0], None)
     vectors = _take_vectors(table, joints)
@@ -123,7 +123,7 @@ def read_deployment(
         rows = len(signal.values)
         if not np.isfinite(signal.values).all():
             raise UsageError(f"{path}: {name} has values that are not finite")
-        if rows == 1:  # holds for all
+        if rows == 1:  # the same for all
             continue
         reader.questions.clear()
         node = "actuator" if name in ("command", "obs", "action", "target") else "sensor"
@@ -131,14 +131,14 @@ def read_deployment(
         if reader.questions:
             raise UsageError(
                 f"{path}: {name} has {rows} rows; their times: {'; '.join(reader.questions.values())}",
-                hint=f"give it the rows of the times t, or times of its own; the file has {listed}",
+                hint=f"give it as many rows as the times t, or separate times; the file has {listed}",
             )
     of_steps = next(n for n in ("action", "target", "obs") if n in times)
     step_t, state_t = times[of_steps], times["q"]
     values = signals[of_steps].values
     new = np.flatnonzero(np.append(True, (values[1:] != values[:-1]).any(axis=1)))
     grain_s = 0.0
-    if len(new) > 20 and np.median(np.diff(new)) > 1.0:  # a recorder that is faster than the policy
+    if len(new) > 20 and np.median(np.diff(new)) > 1.0:  # the recorder is faster than the policy
         step_t, grain_s = step_t[new], float(np.median(np.diff(step_t)))
     if len(step_t) < 20:
         raise UsageError(f"{path} has {len(step_t)} steps of the policy, too few")
@@ -149,7 +149,7 @@ def read_deployment(
         wanted = state_t if name in ("q", "dq", "quat", "gyro", "lin_vel") else step_t
         own = times.get(name, wanted[:1])
         rows = newest(own, wanted)
-        if name == "target":  # it leaves after its step
+        if name == "target":  # a target is sent after its step
             rows = np.minimum(np.searchsorted(own, wanted - 1e-6), len(own) - 1)
         parts[name] = signal.values[rows]
     if "dq" not in parts:
@@ -160,7 +160,7 @@ def read_deployment(
 
 
 def _vector(name: str) -> tuple[str, str]:
-    """Return what a column is without joints, and which entry: ``observation[3]``, ``/imu.orientation.x``."""
+    """Return the signal without joints of a column, and its entry: ``observation[3]``, ``/imu.orientation.x``."""
     ends = [(len(name), "")] + [(m.start(), name[m.end() :].rstrip("]")) for m in re.finditer(r"[.\[/_]", name)]
     for end, entry in ends:
         parts = [part for part in re.split(r"[./]", name[:end].lower()) if part not in ("data", "values")]
@@ -171,7 +171,7 @@ def _vector(name: str) -> tuple[str, str]:
 
 
 def _take_vectors(table: Table, joints: Sequence[str]) -> dict[str, Signal]:
-    """Return the signals without joints, and take their columns out of the table."""
+    """Return the signals without joints, and remove their columns from the table."""
     columns: dict[str, dict[str, str]] = {}
     for name in list(table.columns):
         kind, entry = _vector(name)
@@ -195,7 +195,7 @@ def _take_vectors(table: Table, joints: Sequence[str]) -> dict[str, Signal]:
 
 
 def _of_joints(signals: Sequence[Signal], joints: Sequence[str], robot: Sequence[str], drive: str) -> dict[str, Signal]:
-    """Return positions, velocities and targets in the contract's order; columns without names come in the robot's."""
+    """Return positions, velocities and targets in the contract's order; columns without names have the robot's."""
     quantities = {"q": ("position",), "dq": ("velocity",), "target": ("position", "", "torque")}
     if drive == "torque":
         quantities["target"] = ("torque", "position", "")

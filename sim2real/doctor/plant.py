@@ -1,4 +1,4 @@
-"""The plant question: the logged commands replayed through the model, in short windows from where the robot was."""
+"""Checks the plant: replays the logged commands through the model, in short windows that start at measured states."""
 
 from __future__ import annotations
 
@@ -21,12 +21,13 @@ from sim2real.errors import UsageError
 
 _STEP_S, _WINDOW_S, _WINDOWS = 0.0025, 0.2, 40
 _FASTEST = 0.25
-"""Share of the windows that begin where most torque is asked for: a limit acts there, and hardly elsewhere."""
+"""Share of the windows that begin where the commanded torque is largest: torque limits hardly act elsewhere."""
 _LATER_S = 0.010
-"""A delay that is longer by this than that of the training is a fault [s]; a training without a known delay had none,
-and the first 10 ms are those of any robot."""
+"""A delay that is longer than the training's by this is a fault [s]. An unknown delay of the training counts as 0, and
+any robot has up to 10 ms.
+"""
 _UPRIGHT = 0.8
-"""Cosine of the tilt up to which a free robot stands."""
+"""Cosine of the largest tilt at which a robot with a free base counts as standing."""
 _FILM_S, _FRAMES = 1.0, 40
 mujoco: Any = mujoco_c  # its C module has no stubs
 
@@ -35,15 +36,15 @@ mujoco: Any = mujoco_c  # its C module has no stubs
 class _Part(Suspect):
     """A number in which a plant may differ from the model; in its text ``who`` is a joint, or the drives.
 
-    It is a fault if its value is off, and the replay without it has a clearly larger error, with all others estimated
-    again.
+    It is a fault if its value is off, and the replay without it, with all others estimated again, has a clearly larger
+    error.
 
     Attributes:
         usual: The model's value.
         is_off: Whether a value may be a fault.
-        drop: Share of the error without it by which it must lower it to be a fault.
-        of: Whether it is a number of ``all`` joints, of ``one`` of them, of all or ``one too``, of ``each``, or of all
-            and estimated ``with the rest``.
+        drop: By which share it must lower the error to be a fault.
+        of: Whether the number belongs to ``all`` joints, to ``one`` joint, to all or ``one too``, to ``each``, or to
+            all and is estimated ``with the rest``.
     """
 
     usual: float = 0.0
@@ -53,7 +54,7 @@ class _Part(Suspect):
     of: str = "all"
 
     def of_joint(self, joint: str) -> _Part:
-        """Return the same number of one joint; an empty name: of all."""
+        """Return the same number for one joint; an empty name: for all."""
         text = str(self.text).replace("{who}", joint or "the drives")
         return replace(self, names=(f"{self.names[0]} {joint}".strip(),), text=text)
 
@@ -75,17 +76,18 @@ _PARTS = {part.names[0]: part for part in (
     _Part("battery", ("fade",), "{who}: stiffness and largest torque fall by {value:.0%} from the log's start on",
           (0.2, 0.4, 0.6), lambda f: np.minimum(f + np.array((-0.1, -0.03, 0.03, 0.1)), 0.95),
           is_off=lambda f: f > 0.2),
-    # A limit above three quarters of the model's is none: drives that lag look limited a little earlier.
+    # A limit above three quarters of the model's is no fault: lagging drives seem to be limited a little earlier.
     _Part("torque limit", ("limit",), "torque is clipped: {value}", (0.05, 0.08, 0.12, 0.17, 0.24, 0.33, 0.45, 0.6),
           lambda f: np.outer((0.87, 0.93, 1.07, 1.15), f), usual=np.inf, is_off=lambda f: f < 0.75, least=0.12,
           drop=0.17, of="each"),
     _Part("damping", ("kd",), "{who}: {value:.2f} times the contract's damping", (1.0, 0.2, 0.4, 2.5),
           lambda f: f * np.array((0.8, 1.25)), usual=1.0, is_off=lambda f: not 0.5 <= f <= 2.0, of="with the rest"),
 )}  # fmt: skip
-"""Name in a setting -> what it is: factors of the contract's gains, shares of the largest torque asked for (friction,
+"""Name in a setting -> number: factors on the contract's gains, shares of the largest commanded torque (friction,
 limit), of the joint's inertia (armature) and of the robot's mass (payload), an angle [rad], and a share of the gains
-(fade). ``NAME JOINT`` is that of one joint; a limit has a number for each. ``kd``, and ``delay_s`` from a target in the
-log to the motion [s], are estimated with anything else."""
+(fade). ``NAME JOINT`` belongs to one joint; a limit has a number for each joint. ``kd``, and ``delay_s`` from a target
+in the log to the motion [s], are estimated together with any other number.
+"""
 _DELAY = Suspect("delay", ("delay_s",), "", (0.0, 0.007, 0.014, 0.021, 0.028, 0.035, 0.045, 0.06),
                  lambda s: np.maximum(0.0, s + np.array((-0.005, -0.0015, 0.0015, 0.005))))  # fmt: skip
 _NUISANCE = (_DELAY.move, _PARTS["kd"].move)
@@ -95,7 +97,7 @@ _TURNING = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
 def driven_joints(mjcf: Path) -> list[str]:
-    """Return the joints of a model that drives turn, in the order of its actuators, or of its joints without any."""
+    """Return the driven joints of a model, in the order of its actuators; without actuators, all joints."""
     model = read_model(mjcf)
     of_actuators = [int(model.actuator_trnid[i, 0]) for i in range(model.nu)]
     single = [i for i in range(model.njnt) if int(model.jnt_type[i]) in _TURNING]
@@ -150,7 +152,7 @@ class Drives:
         self.limit = np.array(limits)
         for element in (*spec.actuators, *spec.keys, *spec.sensors):
             spec.delete(element)
-        for joint in contract.joints:  # their gains and limits are those of ``with_plant``
+        for joint in contract.joints:  # ``with_plant`` sets gains and limits
             actuator = spec.add_actuator(name=f"doctor_{joint}", target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
             if not self.torque_driven:
                 actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
@@ -161,26 +163,26 @@ class Drives:
         self.qpos = np.array([self.model.joint(j).qposadr[0] for j in contract.joints])
         self.dof = np.array([self.model.joint(j).dofadr[0] for j in contract.joints])
         self.inertia = self.model.dof_M0[self.dof]
-        # Other joints, such as the arms of a walking robot, have controllers of their own.
+        # Other joints, such as the arms of a walking robot, have other controllers.
         others = [i for i in range(given.njnt) if int(given.jnt_type[i]) in _TURNING and i not in ids]
         self.still = [names[i] or f"number {i}" for i in others]
         dofs = given.jnt_dofadr[others]
         self.model.dof_damping[dofs] = 1e4 * self.model.dof_M0[dofs]
         self.free = self.model.njnt > 0 and int(self.model.jnt_type[0]) == int(mujoco.mjtJoint.mjJNT_FREE)
-        # The body that a payload adds to: the heaviest of a free robot, the outermost of a fixed one.
+        # The body that carries a payload: the heaviest of a free robot, the outermost of a fixed robot.
         moved = self.model.jnt_bodyid[[self.model.joint(j).id for j in contract.joints]]
         self.loaded = int(np.argmax(self.model.body_mass)) if self.free else int(moved[-1])
 
     def torque(self, target: np.ndarray, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
-        """Return the torques that targets ask for [N m]."""
+        """Return the drives' torques for targets [N m]."""
         return target if self.torque_driven else self.kp * (target - q) - self.kd * dq
 
     def with_plant(self, plant: Setting, asked: np.ndarray, at: float = 0.0) -> Any:
-        """Return a copy of the model with other drives.
+        """Return a copy of the model with the setting's drives.
 
         Args:
-            asked: The largest torques of the targets ``(J,)`` [N m].
-            at: The moment as a share of the log.
+            asked: The largest commanded torques ``(J,)`` [N m].
+            at: Time as a share of the log.
         """
         model = copy.copy(self.model)
         each = lambda name, usual: np.array([plant.get(f"{name} {j}", usual) for j in self.joints])  # noqa: E731
@@ -201,15 +203,17 @@ class Drives:
 
 
 class Replay:
-    """The log's commands through the model.
+    """Replays the log's commands through the model.
 
     Raises:
-        UsageError: The log has no targets, or too little of a robot that stands.
+        UsageError: The log has no targets, or the robot stands for too short a time.
     """
 
     def __init__(self, drives: Drives, log: Log) -> None:
         if log.target is None:
-            raise UsageError("the plant needs the targets that were sent to the drives, and the log has none")
+            raise UsageError(
+                "the check of the plant needs the targets that were sent to the drives, but the log has none"
+            )
         self.drives, self.log = drives, log
         count = round(_WINDOW_S / drives.model.opt.timestep)
         self.step_t = np.arange(count) * drives.model.opt.timestep
@@ -227,18 +231,18 @@ class Replay:
         self._errors: dict[Setting, np.ndarray] = {}
 
     def _windows(self) -> np.ndarray:
-        """Return the measurements from which windows begin: spread over the log, and where most torque is asked for."""
+        """Return the measurements at which windows begin: spread over the log, and where the torque is largest."""
         log, free = self.log, self.drives.free
-        # A free robot falls on its feet first; any robot's first targets are on their way.
+        # Skip the begin: a free robot first falls on its feet, and the first targets have not arrived.
         begin, end = max(log.state_t[0], log.t[0]) + (0.3 if free else 0.04), min(log.state_t[-1], log.t[-1] + 0.02)
         rows = np.flatnonzero((log.state_t >= begin) & (log.state_t + _WINDOW_S <= end))
         quat = log.quat if free else None
-        if quat is not None:  # a robot that lies touches the ground with what the model may lack
+        if quat is not None:  # a lying robot may touch the ground with parts that the model lacks
             lying = np.cumsum(matrices(quat)[:, 2, 2] < _UPRIGHT)
             last = np.searchsorted(log.state_t, log.state_t[rows] + _WINDOW_S).clip(0, len(lying) - 1)
             rows = rows[lying[last] == lying[rows - 1]]
         if len(rows) < 3 or np.ptp(log.state_t[rows]) < 0.3:
-            raise UsageError("the log has less than half a second of a robot that stands, too little for a replay")
+            raise UsageError("the robot stands for less than half a second in the log, too short for a replay")
         fastest = list[int]()
         share = np.abs(self._torque / self.asked).max(1) * (not free)
         for step in np.argsort(-share):
@@ -252,16 +256,16 @@ class Replay:
 
     @cached_property
     def _torque(self) -> np.ndarray:
-        """The torques that the targets ask for at the policy's steps ``(N, J)`` [N m]."""
+        """The drives' torques for the targets at the policy's steps ``(N, J)`` [N m]."""
         return self.drives.torque(known(self.log.target), self.log.at_steps("q"), self.log.at_steps("dq"))
 
     @cached_property
     def asked(self) -> np.ndarray:
-        """The largest torques that the targets ask for ``(J,)`` [N m]."""
+        """The largest torques for the targets ``(J,)`` [N m]."""
         return np.quantile(np.abs(self._torque), 0.99, axis=0) + 1e-6
 
     def _state(self, k: int) -> np.ndarray:
-        """Return MuJoCo's full physics state at a measurement; a free base stands on its lowest points."""
+        """Return MuJoCo's full physics state at a measurement; a robot with a free base stands on its lowest points."""
         d, log = self.drives, self.log
         data = mujoco.MjData(d.model)
         data.qpos[d.qpos], data.qvel[d.dof] = log.q[k], log.dq[k]
@@ -300,7 +304,7 @@ class Replay:
         log, target, h = self.log, known(self.log.target), self.drives.model.opt.timestep
         initial = self.initial if initial is None else initial
         times = log.state_t[self.starts][:, None] + self.step_t[None] if times is None else times
-        # The mean of the targets over each step of the simulation, so that a delay acts below its step.
+        # Use the mean of the targets over each simulation step, so that the error is smooth in the delay.
         wanted = times - plant.get("delay_s", 0.0)
         knots = np.concatenate([log.t[:1] - 1.0, log.t, log.t[-1:] + 1.0])
         held = np.concatenate([target[:1], target])
@@ -312,12 +316,12 @@ class Replay:
         return np.asarray(rollout.rollout(models if len(models) > 1 else models[0], self._threads, initial, control)[0])
 
     def residuals(self, plant: Setting) -> np.ndarray:
-        """Return the simulated angles less the measured ones, as a share of the motion ``(W, T, J)``."""
+        """Return simulated minus measured angles ``(W, T, J)``, as a share of the motion."""
         error = (self.rolled(plant)[:, :, 1 + self.drives.qpos] - self.measured) / self.scale
         return np.where(self.used[:, :, None], np.nan_to_num(error, nan=9.0), 0.0)
 
     def error(self, plant: Setting) -> float:
-        """Return the mean error of the replay as a share of the joints' motion; each counts at most 1.5."""
+        """Return the mean error of the replay, as a share of the joints' motion; each error counts at most 1.5."""
         return float(self.errors(plant).mean())
 
     def errors(self, plant: Setting) -> np.ndarray:
@@ -328,14 +332,14 @@ class Replay:
         return self._errors[plant]
 
     def sag(self, plant: Setting) -> np.ndarray:
-        """Return how far the joints of the robot are from the model's at the ends of the windows, with sign [rad]."""
+        """Return the signed differences between robot and model at the ends of the windows ``(J,)`` [rad]."""
         last = self.used.shape[1] - 1 - np.argmax(self.used[:, ::-1], axis=1)
         return -np.median(self.residuals(plant)[np.arange(len(last)), last], axis=0) * self.scale
 
     def candidates(self, plant: Setting) -> Iterator[Candidate]:
         """Return what may be wrong beside what is known already."""
         delay_s = plant.get("delay_s", 0.0)
-        # Soft or limited drives look late and damped at first.
+        # At first, soft or limited drives look like late and damped ones.
         starts = [plant, *(plant.having({"kd": 1.0, "delay_s": d}) for d in (delay_s, 0.011, 0.6 * delay_s))]
         for name, part in _PARTS.items():
             if self.drives.torque_driven and name in ("kp", "kd", "zero"):
@@ -349,18 +353,18 @@ class Replay:
                     yield self._of_each(part, start)
 
     def _of_each(self, part: _Part, start: Setting) -> Candidate:
-        """Return a part with a number for each joint; a joint has one only if that explains a tenth of its error."""
+        """Return a part with a number for each joint that thereby loses at least a tenth of its error."""
         name = part.names[0]
         of = lambda plant: np.broadcast_to(plant.get(name, part.usual), len(self.scale))  # noqa: E731
 
         def mixed(plants: Sequence[Setting]) -> Setting:
-            """Return the first plant, in which each joint has the number of the plant in which it moves best."""
+            """Return the first plant, with each joint's number from the plant in which it moves best."""
             numbers = np.array([of(p) for p in plants])
             errors = np.array([self.errors(p) for p in plants]) * np.where(numbers == part.usual, 0.9, 1.0)
             best = np.take_along_axis(numbers, errors.argmin(0)[None], 0)[0]
             return plants[0].having({name: tuple(best.tolist())} if (best != part.usual).any() else {})
 
-        # Other gains of one joint, which are no fault, look like its limit.
+        # Other gains of one joint, which are no fault, look like a limit.
         others = [start.having({"kp": p * start.get("kp"), "kd": d * start.get("kd")})
                   for p, d in ((0.85, 1.0), (1.18, 1.0), (1.0, 0.7), (1.0, 1.4))]  # fmt: skip
         tried = [start, *(start.having({name: (v,) * len(self.scale)}) for v in part.grid), *others]
@@ -368,7 +372,7 @@ class Replay:
         return Candidate(part.fault, mixed(tried), lambda _: "", (near, *_NUISANCE), part.least)
 
     def _of_one(self, name: str, plant: Setting) -> Iterator[Candidate]:
-        """Return a part of the joint that moves better if all joints have it."""
+        """Return a part for the joint whose error falls most if all joints have it."""
         part, joints = _PARTS[name], self.drives.joints
         if part.of == "one":
             tried = [plant.having({f"{name} {j}": v for j in joints}) for v in part.grid]
@@ -380,7 +384,7 @@ class Replay:
             yield from part.of_joint(joint).candidates(plant, *_NUISANCE)
 
     def limited(self, plant: Setting) -> dict[str, float]:
-        """Return the torque limits that are well below the model's, by joint [N m]."""
+        """Return joint -> torque limit, for limits well below the model's [N m]."""
         limits = np.array(plant.get("limit", np.inf)) * self.asked
         low = np.array([_PARTS["limit"].is_off(share) for share in limits / self.drives.limit])
         return {j: float(nm) for j, nm, is_low in zip(self.drives.joints, limits, low, strict=True) if is_low}
@@ -406,7 +410,7 @@ def lowest_points(model: Any, data: Any) -> list[tuple[int, np.ndarray]]:
 def solve_plant(
     drives: Drives, log: Log, contract: Contract, trained_delay_s: float | None = None
 ) -> tuple[list[Finding], dict[str, Any]]:
-    """Return what is wrong with the plant, and figures of the replay.
+    """Return the faults of the plant, and figures of the replay.
 
     Args:
         trained_delay_s: Delay of the training; default: the contract's.
@@ -417,7 +421,7 @@ def solve_plant(
     age_s = 0.0 if log.rows_are_steps or log.age_s is None else float(np.median(log.age_s))
     nominal = Setting().having({"delay_s": max(0.0, (trained or 0.0) - age_s)})
     delay_s, base, best = fitted.get("delay_s", 0.0) + age_s, replay.error(nominal), replay.error(fitted)
-    # What may be a fault: its name in the setting, fault, sentence, value, and share of the error without it.
+    # Possible faults: name in the setting, fault, sentence, value, and the share by which it lowers the error.
     suspects = [
         (name, part.fault, own.says(fitted), fitted.get(name), part.drop)
         for part in _PARTS.values() if part.of != "each"
@@ -433,7 +437,7 @@ def solve_plant(
         text = f"motion follows a target after {1e3 * delay_s:.0f} ms; the training had {of_training}"
         suspects.append(("delay_s", "delay", text, delay_s, 0.07))
     for name, fault, text, value, least in suspects:
-        # The others are estimated again without it.
+        # Estimate the others again without it.
         rest = Setting(tuple((n, v) for n, v in fitted.values if n != name))
         moves = [*([_PARTS["kd"].move] if name != "kd" else []), *([_PARTS["kp"].move] if "kp" in rest else [])]
         if fault == "delay":
@@ -461,7 +465,7 @@ def solve_plant(
 
 
 def _with_signs(drives: Drives, log: Log) -> tuple[list[Finding], Replay, Candidate]:
-    """Return the replay and its delay, with the joints turned that the log has with the other sign."""
+    """Return the replay and its delay, after correcting joints with a wrong sign in the log."""
 
     def started(replay: Replay) -> Candidate:
         best = min(_DELAY.candidates(Setting(), *_NUISANCE), key=lambda c: replay.error(c.setting))
@@ -483,7 +487,7 @@ def _with_signs(drives: Drives, log: Log) -> tuple[list[Finding], Replay, Candid
 
 
 def parting(replay: Replay, plant: Setting, joints: Sequence[str]) -> dict[str, Any]:
-    """Return the first window in which the fitted model leaves the robot, its worst joint, and both from there on."""
+    """Return the first window in which the fitted model departs from the robot, its worst joint, and both motions."""
     error = np.abs(replay.residuals(plant)).mean(1)
     limit = max(4.0 * float(np.median(error)), 0.3)
     worse = np.flatnonzero(error.max(1) > limit)
@@ -498,7 +502,7 @@ def parting(replay: Replay, plant: Setting, joints: Sequence[str]) -> dict[str, 
     simulated = states[shown, 1 : 1 + d.model.nq]
     robot = simulated.copy()
     robot[:, d.qpos] = measured
-    if d.free:  # where the base was is not measured
+    if d.free:  # the position of the base is not measured
         robot[:, :3] = simulated[0, :3]
         if log.quat is not None:
             robot[:, 3:7] = log.quat[np.searchsorted(log.state_t, times[shown] + h).clip(0, len(log.quat) - 1)]
@@ -511,7 +515,7 @@ def parting(replay: Replay, plant: Setting, joints: Sequence[str]) -> dict[str, 
 
 
 def drawn(model: Any, qpos: np.ndarray) -> list[Any]:
-    """Return a line of points (x, y, z) for each pose ``(T, nq)`` and body: its parent, itself, and its centre."""
+    """Return for each pose ``(T, nq)`` and body a line of points (x, y, z): parent, body, centre of the body."""
     data, frames = mujoco.MjData(model), []
     parents = np.where(model.body_parentid == 0, np.arange(model.nbody), model.body_parentid)
     for pose in qpos:

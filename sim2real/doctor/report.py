@@ -1,4 +1,4 @@
-"""The page of a diagnosis: one sentence, then a section for each question."""
+"""The page of a diagnosis: one sentence, then sections on contract, timing and plant."""
 
 from __future__ import annotations
 
@@ -68,14 +68,14 @@ def _figure(draw: Callable[[Any], None], name: str, caption: str, height_in: flo
 
 
 def _bars(errors: Mapping[str, Any], name: str, caption: str, height_in: float = 2.2) -> FigureBlock:
-    """Draw two errors for each name: before, and with what was found."""
+    """Draw two errors for each name: before, and with the found faults corrected."""
 
     def draw(axis: Any) -> None:
         at, values = np.arange(len(errors)), np.array(list(errors.values())).reshape(-1, 2)
         axis.barh(at - 0.2, values[:, 0], 0.38, color=INK, label="by the contract and the model")
         axis.barh(at + 0.2, values[:, 1], 0.38, color=BLUE, label="with what was found")
         axis.set_yticks(at, list(errors))
-        axis.set_xlim(0.0, max(0.1, 1.05 * values.max(initial=0.0)))  # rounding errors are no bars
+        axis.set_xlim(0.0, max(0.1, 1.05 * values.max(initial=0.0)))  # draw no bars for rounding errors
         axis.invert_yaxis()
         axis.legend()
 
@@ -106,12 +106,12 @@ def _parting(at: Mapping[str, Any]) -> FigureBlock:
 
 
 def _film(at: Mapping[str, Any]) -> FigureBlock:
-    """Draw the bodies of robot and model beside each other, moving from the moment at which they part.
+    """Draw an animation of robot and model, side by side, from the moment at which they part.
 
-    The drawing moves by itself, without a script, which the page forbids.
+    It needs no script, which the page forbids.
     """
-    both = np.array([at["film"][name] for name in _LOOKS])  # robot or model, moment, body, point, coordinate
-    side = int(np.ptp(both[..., 1]) > np.ptp(both[..., 0]))  # the side from which more is seen
+    both = np.array([at["film"][name] for name in _LOOKS])  # axes: robot or model, moment, body, point, coordinate
+    side = int(np.ptp(both[..., 1]) > np.ptp(both[..., 0]))  # the view that shows more motion
     flat = both[..., [side, 2]] * [1.0, -1.0]
     low = flat.min((0, 1, 2, 3))
     size = np.maximum(flat.max((0, 1, 2, 3)) - low, 0.3 * max(np.ptp(flat[..., 0]), np.ptp(flat[..., 1])))

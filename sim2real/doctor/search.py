@@ -1,4 +1,4 @@
-"""The search for what is wrong: suspects change a setting, and those stay that explain most of an error."""
+"""Searches for faults: suspects change a setting, and the ones that explain most of an error are kept."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ _MOST, _HEADS, _SWEEPS = 4, 6, 4
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that is wrong.
+    """A fault.
 
     Attributes:
-        fault: Its name, such as ``joint order``.
+        fault: Name of the fault, such as ``joint order``.
         question: ``contract``, ``timing`` or ``plant``.
         text: One sentence.
         share: Share of the gap that it explains, from 0 to 1.
@@ -30,16 +30,16 @@ class Finding:
 
 @dataclass(frozen=True)
 class Setting:
-    """What a deployment is like: name -> value, of what differs from what was agreed."""
+    """The differences of a deployment from its contract or model: name -> value."""
 
     values: tuple[tuple[str, Any], ...] = ()
 
     def get(self, name: str, usual: Any = 1.0) -> Any:
-        """Return the value of a name."""
+        """Return the value of a name; ``usual`` if the setting has none."""
         return dict(self.values).get(name, usual)
 
     def having(self, values: Mapping[str, Any]) -> Setting:
-        """Return the setting with other values of some names."""
+        """Return the setting with other values for some names."""
         return Setting(tuple(sorted((dict(self.values) | dict(values)).items())))
 
     def __contains__(self, name: str) -> bool:
@@ -51,12 +51,12 @@ Move = Callable[[Setting], Iterable[Setting]]
 
 @dataclass(frozen=True)
 class Candidate:
-    """A setting with one thing wrong, beside what is known already.
+    """A setting with one more fault than the known ones.
 
     Attributes:
         text: Returns the sentence about a setting.
-        moves: Each returns settings near one, which differ in one way.
-        least: Share of the error by which it must lower it.
+        moves: Functions that return settings near a given one.
+        least: Smallest share by which it must lower the error.
     """
 
     fault: str
@@ -66,7 +66,7 @@ class Candidate:
     least: float = 0.12
 
     def descended(self, error: Callable[[Setting], float]) -> Candidate:
-        """Return the candidate with the best setting near its own, one way after the other."""
+        """Return the candidate with the best setting nearby, after trying its moves in turn."""
         best = self.setting
         for _ in range(_SWEEPS):
             before = best
@@ -79,13 +79,13 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Suspect:
-    """One thing that may be wrong: names of a setting, all of which get one of some values.
+    """A possible fault: names of a setting, all of which get the same value.
 
     Attributes:
         text: A sentence with ``value`` and ``ms``, or a function of the value.
         grid: The values that are tried first.
-        near: Returns those near a value.
-        least: As of a candidate.
+        near: Returns values near a given value.
+        least: As in ``Candidate``.
     """
 
     fault: str
@@ -96,7 +96,7 @@ class Suspect:
     least: float = 0.12
 
     def move(self, at: Setting) -> Iterable[Setting]:
-        """Return settings near one."""
+        """Return settings near a given one."""
         value = at.get(self.names[0], self.grid[0])
         return [at.having(dict.fromkeys(self.names, v)) for v in self.near(value)]
 
@@ -123,17 +123,18 @@ def explain(
     sound: float,
     dear: bool = False,
 ) -> list[Candidate]:
-    """Return the candidates that explain an error, the greatest first; each setting has those before it.
+    """Return the candidates that explain an error, the most important first; each setting includes those before it.
 
     Args:
-        error: Error of a setting; it keeps what it has computed.
-        candidates: Returns what may be wrong beside what a setting has already.
-        sound: Error below which nothing is wrong.
-        dear: Whether an error takes long: fewer candidates are followed, and two that explain only together are missed.
+        error: Returns the error of a setting; caches its results.
+        candidates: Returns further possible faults of a setting.
+        sound: Error below which there is no fault.
+        dear: Whether ``error`` takes long: then fewer candidates are tried, and faults that show only together are
+            missed.
     """
 
     def ranked(setting: Setting) -> list[Candidate]:
-        """Return the candidates in their order; the best of all and of each fault have the best setting near theirs."""
+        """Return the candidates, the best first; the best of all, and the best of each fault, are refined."""
         found = sorted(candidates(setting), key=lambda c: error(c.setting))
         of_faults = list({c.fault: i for i, c in reversed(list(enumerate(found)))}.values())
         for i in {*range(min(0 if dear else 3, len(found))), *sorted(of_faults)[: 3 if dear else _HEADS]}:
@@ -159,5 +160,5 @@ def explain(
 
 
 def shortened(parts: Sequence[str]) -> str:
-    """Return two of many parts of a sentence, and how many more there are."""
+    """Return the first two of many parts of a sentence, and the number of the others."""
     return ", ".join(parts[:2]) + (f" and {len(parts) - 2} more" if len(parts) > 2 else "")

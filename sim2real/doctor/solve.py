@@ -1,4 +1,4 @@
-"""The contract question: which way of making observations and targets gives what the deployment's log has."""
+"""Checks the contract: finds the faults with which computed observations, actions and targets equal the log's."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ from sim2real.doctor.log import Log, newest
 from sim2real.doctor.search import Candidate, Finding, Setting, Suspect, explain, shortened
 
 _SOUND, _FINE = 0.01, 0.0015
-"""Mean errors below this share of the signal's deviation are none: rounding, and samples a few milliseconds apart;
-in a logged observation one term of many may be wrong."""
+"""Mean errors below this share of the signal's standard deviation are no fault, but rounding or samples a few
+milliseconds apart. For logged observations it is smaller, because one term of many may be wrong.
+"""
 _LATE_S = 0.012
-"""Measurements that are older than the log's newest by less are no fault."""
+"""A smaller additional age of measurements is no fault [s]."""
 _PLACES = {"the observation": ("seen",), "the targets": ("moved",), "observation and targets": ("seen", "moved")}
 _LEFT_AND_RIGHT = ("fl fr", "rl rr", "lf rf", "lh rh", "hl hr", "bl br", "lb rb", "left right", "l r")
 _FACTORS = (1 / 57.3, 0.05, 0.1, 0.2, 0.25, 0.5, 2.0, 4.0, 5.0, 10.0, 20.0, 57.3)
@@ -30,7 +31,7 @@ _AXES = [tuple(s * i for s, i in zip(signs, order, strict=True)) for order in it
 
 
 class Link:
-    """One link of the chain from measurements to targets, and what may be wrong in it.
+    """One link of the chain from measurements to targets, with its possible faults.
 
     Args:
         name: ``observation``: measurements to the logged observations; ``network``: measurements to actions, if
@@ -43,26 +44,26 @@ class Link:
         self.d, self.name, self.robot_joints = deployed, name, robot_joints
         self._errors: dict[Setting, float] = {}
         self._sees = name in ("observation", "network")
-        # Without logged actions, the targets are a part of the question about the network.
+        # Without logged actions, targets stand for the network's output.
         lacks = deployed.log.action is None and deployed.log.target is not None
         self._moves = name == "target" or (name == "network" and lacks)
         there = ["seen"] * self._sees + ["moved"] * self._moves
         self._places = [place for place, sides in _PLACES.items() if set(sides) <= set(there)]
 
     def wanted(self, how: Setting) -> np.ndarray:
-        """Return what was logged at the end of the link at all steps ``(N, outputs)``."""
+        """Return the logged values at the end of the link ``(N, outputs)``."""
         return known({"target": self.d.log.target, "observation": self.d.logged}.get(self.name, self.d.actions(how)))
 
     def given(self, how: Setting) -> np.ndarray:
-        """Return the observations ``(R, O)``."""
+        """Return the observations at the start of the link ``(R, O)``."""
         d, rows = self.d, np.maximum(self.d.rows - how.get("stale", 0), 0)
         return known(d.logged)[rows] if self.name == "normaliser" else d.observations(how, rows)
 
     def predicted(self, how: Setting, given: np.ndarray | None = None) -> np.ndarray:
-        """Return what a deployment would have logged at the end of the link ``(R, outputs)``.
+        """Return the values at the end of the link for a setting ``(R, outputs)``.
 
         Args:
-            given: What the network is given, before gain and bias, if it is known already.
+            given: Observations before gain and bias, if they are computed already.
         """
         d = self.d
         if self.name == "target":
@@ -76,7 +77,7 @@ class Link:
         return d.policy.network(x)
 
     def residuals(self, how: Setting, given: np.ndarray | None = None) -> np.ndarray:
-        """Return the differences from what was logged ``(R, outputs)``, in units of its deviation."""
+        """Return the differences from the logged values ``(R, outputs)``, in standard deviations of the log."""
         all_rows = self.wanted(how)
         wanted, predicted = all_rows[self.d.rows], self.predicted(how, given)
         if how.get("clipped", False):
@@ -85,13 +86,13 @@ class Link:
         return (predicted - wanted) / np.maximum(each, 0.2 * np.median(each) + 1e-4)
 
     def error(self, how: Setting) -> float:
-        """Return the mean error, each part of which counts as at most 1.5."""
+        """Return the mean error; each error counts at most 1.5."""
         if how not in self._errors:
             self._errors[how] = float(np.minimum(np.abs(self.residuals(how)), 1.5).mean())
         return self._errors[how]
 
     def solve(self) -> list[Candidate]:
-        """Return what is wrong, the greatest first."""
+        """Return the faults, the most important first."""
         if (before := self.error(Setting())) < (sound := _FINE if self.name == "observation" else _SOUND):
             return []
         chosen = explain(Setting(), self.error, self.candidates, sound)
@@ -99,7 +100,7 @@ class Link:
         clear = error < 0.1 * before
         if self.name not in ("network", "normaliser") or error < _SOUND or (clear and len(chosen) < 2):
             return chosen
-        # Another normaliser, if it explains more: alone, or beside what leaves much unexplained.
+        # Try another normaliser: alone, and together with faults that leave much unexplained.
         tried = []
         for count in sorted({0} if clear else {0, min(1, len(chosen)), len(chosen)}):
             made = self._normaliser(chosen[count - 1].setting if count else Setting())
@@ -107,11 +108,11 @@ class Link:
             tried.append([*chosen[:count], Candidate("normaliser", made, lambda _, text=text: text)])
         alone = [c for c in tried if self.error(c[-1].setting) < _SOUND][:1]
         best = min(alone or tried, key=lambda c: self.error(c[-1].setting) * (1 + 0.1 * len(c)))
-        # Two free numbers for each entry halve many an error: they must explain three quarters of it.
+        # Two free numbers for each entry lower any error: they must explain three quarters of it.
         return best if self.error(best[-1].setting) < (_SOUND if clear else min(0.5 * error, 0.25 * before)) else chosen
 
     def _normaliser(self, how: Setting) -> Setting:
-        """Return a way with the gain and the bias of each entry of the observation that fit best."""
+        """Return the setting with the best gain and bias of each entry of the observation."""
         given = self.given(how)
         size, unit = given.shape[1], np.maximum(given.std(0), 1e-3)
 
@@ -124,7 +125,7 @@ class Link:
     # -- suspects
 
     def candidates(self, how: Setting) -> Iterator[Candidate]:
-        """Return what may be wrong beside what is known already."""
+        """Return further possible faults of a setting."""
         for suspect in self._suspects(how):
             if not any(name in how for name in suspect.names):
                 yield from suspect.candidates(how)
@@ -132,7 +133,7 @@ class Link:
             yield from self._of_joints(how, place)
 
     def _suspects(self, how: Setting) -> Iterator[Suspect]:
-        """Return all suspects but those of single joints."""
+        """Return all suspects except those of single joints."""
         d, c, sees = self.d, self.d.contract, self._sees
         shares = np.arange(0.0, 0.95, 0.01).tolist()
         period_s, imu = float(np.median(np.diff(d.log.t))), {"ang_vel", "gravity"} & d.made
@@ -189,7 +190,7 @@ class Link:
             yield Suspect("action clipped", ("clipped",), text, (True,))
 
     def _of_joints(self, how: Setting, place: str) -> Iterator[Candidate]:
-        """Return other orders, signs and poses of the joints in a place."""
+        """Return other orders, signs and poses of the joints, ``seen`` or ``moved``."""
         joints, sides = self.d.contract.joints, _PLACES[place]
         names = lambda what: tuple(f"{what} {side}" for side in sides)  # noqa: E731
         if len(joints) > 1 and not any(name in how for name in names("order")):
@@ -224,7 +225,7 @@ class Link:
         return f"{words} in {place}: {shortened(moved)}"
 
     def _orders(self, how: Setting) -> Iterator[Any]:
-        """Return orders in which joints may come: matched to the log, mirrored, sorted, by type or leg, exchanged."""
+        """Return possible orders of joints: matched to the log, mirrored, sorted, by type or leg, exchanged."""
         joints = self.d.contract.joints
         count = len(joints)
         if self.name in ("observation", "target"):
@@ -248,7 +249,7 @@ class Link:
         yield from _exchanges(range(count))
 
     def _matched(self, how: Setting) -> Any:
-        """Return the order in which the logged columns fit the expected ones best."""
+        """Return the order in which logged columns fit the expected ones best."""
         d, rows = self.d, self.d.rows
         if self.name == "target":
             cost = _distance(d.targets(how, d.acted[rows]), known(d.log.target)[rows])
@@ -262,19 +263,19 @@ class Link:
 
 
 def _near_share(share: float) -> list[float]:
-    """Return shares near one, down to a step of the policy: the values of each step are others."""
+    """Return shares near a given one, down to one step of the policy."""
     moves = np.concatenate([np.arange(-0.06, 0.061, 0.0015), np.arange(-0.0015, 0.0015, 0.0003)])
     return np.clip(share + moves, 0.0, 0.99).tolist()
 
 
 def _fitted(residuals: Callable[[np.ndarray], np.ndarray], size: int, step: float, outlier: float) -> np.ndarray:
-    """Return the numbers that make residuals smallest; residuals above ``outlier`` count by their size alone."""
+    """Return the numbers that minimise residuals, with a robust loss: linear above ``outlier``."""
 
     def slopes(theta: np.ndarray) -> np.ndarray:
         base = residuals(theta)
         return np.stack([(residuals(theta + step * e) - base) / step for e in np.eye(size)], -1)
 
-    jac: Any = slopes  # the stubs know names of methods only
+    jac: Any = slopes  # scipy's stubs accept only names of methods
     return least_squares(residuals, np.zeros(size), jac, loss="huber", f_scale=outlier, ftol=1e-3, max_nfev=10).x
 
 
@@ -286,14 +287,14 @@ def _exchanges(order: Sequence[int]) -> Iterator[list[int]]:
 
 
 def _distance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return how little the columns of two arrays vary together ``(A, B)``; means, scales and signs do not count."""
+    """Return 1 minus the absolute correlation of the columns of two arrays, ``(A, B)``."""
     a, b = first - first.mean(0), second - second.mean(0)
     norm = np.linalg.norm(a, axis=0)[:, None] * np.linalg.norm(b, axis=0) + 1e-9
     return 1.0 - np.abs(a.T @ b) / norm
 
 
 def mirror_of(joints: Sequence[str]) -> tuple[int, ...] | None:
-    """Return the joint on the other side of each joint, by the names; None if a name has no counterpart."""
+    """Return for each joint the joint on the other side, by name; None if a name has no counterpart."""
     pairs: dict[str, str] = {}
     for a, b in (pair.split() for pair in _LEFT_AND_RIGHT):
         pairs |= {a: b, b: a}
@@ -308,7 +309,7 @@ def mirror_of(joints: Sequence[str]) -> tuple[int, ...] | None:
 def solve_contract(
     log: Log, policy: Policy, robot_joints: Sequence[str] = ()
 ) -> tuple[list[Finding], dict[str, float]]:
-    """Return what is wrong between measurements, observations, actions and targets, and the error of each link."""
+    """Return the faults between measurements, observations, actions and targets, and the error of each link."""
     deployed, errors = Deployed(log, policy), dict[str, float]()
     findings = frozen_sensors(log, policy.contract.joints)
     has_obs, has_action, has_target = log.obs is not None, log.action is not None, log.target is not None
@@ -337,7 +338,7 @@ def solve_contract(
 
 
 def frozen_sensors(log: Log, joints: Sequence[str]) -> list[Finding]:
-    """Return a finding if the IMU repeats itself while joints move, or a joint while its commands do."""
+    """Return a finding if the IMU is constant while joints move, or a joint while its commands change."""
     moving = np.abs(np.diff(log.q, axis=0)).max(1) > 1e-4
     given = log.action if log.target is None else log.target
     commands = None if given is None else given[newest(log.t, log.state_t)].T

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from sim2real.stages.train.config import TrainConfig
 
     Source = str | Path | Robot
-    """A run folder, or a robot or the name of its pipeline; of these the newest identification is taken."""
+    """A run folder, or a robot or the name of its pipeline, whose newest identification is taken."""
 
 
 def robot_environment(
@@ -35,13 +35,13 @@ def robot_environment(
 
     Args:
         model: The estimates of identify with their uncertainty and timing, or the data sheet's values.
-        values: Parameters with other values than the model's. The nominal model has delays where both are among them:
+        values: Values of parameters that replace the model's. The nominal model has delays only if both are given:
             ``sensor_delay`` and ``actuator_delay`` [s].
         config: World, number and length of timelines, randomisation and seed; default: the robot's.
 
     Raises:
-        UsageError: When there is no such pipeline, run or parameter.
-        Sim2RealError: When there is no identification, or not of this robot.
+        UsageError: There is no such pipeline, run or parameter.
+        Sim2RealError: There is no identification, or it is of another robot.
     """
     from sim2real.artifacts.identification import Identification
     from sim2real.artifacts.run import STAGES, attempts
@@ -75,8 +75,8 @@ def vector_env(
     """Return copies of a robot as a ``gymnasium.vector.VectorEnv``.
 
     Args:
-        source: See ``robot_environment``, which ``options`` go to as well; or its result.
-        autoreset_mode: When a copy that is done is reset: ``NextStep`` or ``SameStep``.
+        source: See ``robot_environment``, which also gets ``options``; or its result.
+        autoreset_mode: When a finished copy is reset: ``NextStep`` or ``SameStep``.
     """
     from sim2real.interop.vector import CopiesVectorEnv
 

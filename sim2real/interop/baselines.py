@@ -11,22 +11,22 @@ from sim2real.interop.vector import AutoresetMode, CopiesVectorEnv
 from sim2real.types import PyTree
 
 Indices = int | Iterable[int] | None
-"""Copies; None: all."""
+"""Indices of copies; None: all."""
 
 
 def to_baselines(env: CopiesVectorEnv, seed: int | None = None) -> Any:
     """Return a vector environment as a ``stable_baselines3.common.vec_env.VecEnv``.
 
-    An episode that a time limit ended has ``TimeLimit.truncated`` in its info, and every episode that ended
-    ``terminal_observation``: Stable-Baselines3 estimates the value of the state after it from that.
+    At the end of an episode, infos have ``terminal_observation``, and ``TimeLimit.truncated`` if a time limit ended it:
+    from these Stable-Baselines3 estimates the value of the state after the episode.
 
     Args:
-        env: Its ``autoreset_mode`` must be ``"SameStep"``.
+        env: Environment whose ``autoreset_mode`` is ``"SameStep"``.
         seed: Seed of the episodes; default: a random one.
 
     Raises:
-        Sim2RealError: When Stable-Baselines3 is not installed.
-        UsageError: When copies are reset in another step.
+        Sim2RealError: Stable-Baselines3 is not installed.
+        UsageError: Copies are reset in another step.
     """
     if env.autoreset_mode is not AutoresetMode.SAME_STEP:
         raise UsageError(
@@ -35,14 +35,14 @@ def to_baselines(env: CopiesVectorEnv, seed: int | None = None) -> Any:
             hint="make it with autoreset_mode='SameStep'",
         )
     try:
-        # By name: Stable-Baselines3 installs PyTorch, so it is no dependency.
+        # Import by name: Stable-Baselines3 installs PyTorch, so it is no dependency.
         base: Any = importlib.import_module("stable_baselines3.common.vec_env").VecEnv
     except ImportError as error:
         raise Sim2RealError(
             "Stable-Baselines3 is not installed", hint="pip install stable-baselines3, which installs PyTorch"
         ) from error
 
-    # The adapter's class inherits from theirs, so it is made here.
+    # The adapter inherits from their class, so it is defined here.
     adapted: Any = type("BaselinesVecEnv", (_Copies, base), {"env": env, "_seed": seed})
     return adapted(env.num_envs, env.single_observation_space, env.single_action_space)
 

@@ -35,22 +35,20 @@ _STEPS = "steps"
 class BraxEnv(Env):
     """A composed task on MJX, or a robot with its delays.
 
-    The observation of a task is a vector: its observables, one after the other, in their order. Actions of a task
-    follow its ``action_spec``; those of a robot go from -1, the lower bound of ``environment.action``, to 1, the upper
-    one, as brax has no bounds of actions. ``info["failed"]`` is 1 where a task drew no acceptable initial
-    state.
+    The observation of a task is a vector of its observables in their order. Actions of a task follow its
+    ``action_spec``; actions of a robot go from -1 to 1, for the bounds of ``environment.action``, as brax has no bounds
+    of actions. ``info["failed"]`` is 1 if a task drew no acceptable initial state.
 
-    ``info["truncation"]`` is 1 where only the time limit ended an episode. brax's ``EpisodeWrapper`` overwrites that
-    entry, and takes ``done`` for a termination. So under that wrapper a time limit does not set ``done``; the wrapper's
-    own ``episode_length`` ends the episode, as a truncation. It must be at most ``max_episode_length``: the reward is
-    NaN past the time limit.
+    ``info["truncation"]`` is 1 if only the time limit ended an episode. brax's ``EpisodeWrapper`` overwrites this
+    entry, and treats ``done`` as a termination. So with this wrapper a time limit does not set ``done``; the wrapper's
+    ``episode_length`` ends the episode, as a truncation. It must be at most ``max_episode_length``: the reward is NaN
+    beyond the time limit.
 
-    brax's ``AutoResetWrapper`` starts every episode of a copy from the state of its first one, random numbers included:
-    all episodes would be the same. This environment replaces that state at every step by a fresh start, drawn from
-    ``info["key"]``. That costs a reset a step.
+    brax's ``AutoResetWrapper`` starts every episode of a copy from the state of its first episode, with the same random
+    numbers: all episodes would be equal. This environment replaces that state at every step by a fresh start, drawn
+    from ``info["key"]``, which costs a reset in each step.
 
-    ``metrics`` has the values of a robot's whole episode, ``return`` and ``success``, in its last step, and 0 in all
-    others.
+    ``metrics`` has a robot's ``return`` and ``success`` in the last step of an episode, and 0 in all others.
     """
 
     def __init__(self, environment: MjxEnvironment | RobotEnvironment) -> None:
@@ -76,7 +74,7 @@ class BraxEnv(Env):
 
     @property
     def backend(self) -> str:
-        """The engine, in brax's terms: ``mjx`` means an engine other than brax's."""
+        """The name of the engine, for brax: ``mjx`` means an engine other than brax's."""
         return "mjx"
 
     @property
@@ -102,7 +100,7 @@ class BraxEnv(Env):
         if self._middle is not None:
             action = self._middle + self._half * jnp.clip(action, -1.0, 1.0)
         copy = self.environment.step(before, action)
-        # An episode that goes on past its time limit must not train a policy without notice.
+        # An episode beyond its time limit must not train a policy unnoticed.
         reward = jnp.where(before.truncated, jnp.nan, copy.reward)
         return _brax_state(copy, reward, info, state.metrics)
 
@@ -110,11 +108,11 @@ class BraxEnv(Env):
 def _brax_state(
     copy: PyTree, reward: jax.Array, info: dict[str, jax.Array], metrics: dict[str, jax.Array]
 ) -> BraxState:
-    """Return the state of a copy of a task, which has a discount, or of a robot, which has values of its episode."""
+    """Return the state in brax's form, of a task (with a discount) or of a robot (with values of its episode)."""
     dtype = reward.dtype
     done = copy.done & ~copy.truncated if _STEPS in info else copy.done
     info |= {"truncation": copy.truncated.astype(dtype)}
     info |= {n: getattr(copy, n).astype(dtype) for n in ("discount", "failed") if hasattr(copy, n)}
-    of_episode = getattr(copy, "values", {})  # brax's wrappers add metrics of their own, which stay
+    of_episode = getattr(copy, "values", {})  # keep the metrics that brax's wrappers add
     metrics = metrics | {n: jnp.where(copy.done, v, 0.0) for n, v in of_episode.items()}
     return BraxState(copy, to_vector(copy.observation), reward, done.astype(dtype), metrics, info)

@@ -27,7 +27,7 @@ class Entry(NamedTuple):
     Attributes:
         name: E.g. ``past voltage[0][2]``: the term, its age in steps, and the entry of that term.
         unit: ``"1"`` for a number without a unit.
-        low: Lower bound [its unit]; infinite where the robot gives none.
+        low: Lower bound [its unit]; infinite if the robot has none.
         high: Upper bound [its unit].
     """
 
@@ -38,12 +38,12 @@ class Entry(NamedTuple):
 
 
 class Copy(NamedTuple):
-    """The state of one copy of a robot, with what its last step gave; the names are those of a composed task's state.
+    """The state of one copy of a robot, with the results of its last step; named as in a composed task's state.
 
     Attributes:
         key: Source of the random numbers in an episode.
         done: Whether the task or the time limit has ended the episode.
-        truncated: Whether only the time limit has.
+        truncated: Whether only the time limit has ended it.
         values: Name -> values of the whole episode, valid in its last step.
     """
 
@@ -59,11 +59,11 @@ class Copy(NamedTuple):
 class RobotEnvironment:
     """One copy of a robot with its delays.
 
-    Every step is a step of the policy. A row of the graph in which the policy makes none (it paused, or its rate does
-    not divide the world's) belongs to the policy's step before it: its reward is added to that step's, and the
-    observation is that of the next step. Every episode has a random timeline of the graph and parameters of its own. It
-    is truncated at the policy's last step in the timeline, whose observation is the final one. Actions are clipped to
-    their bounds, as the gate does on the robot.
+    Every step is a step of the policy. A row of the graph without a step of the policy (it paused, or its rate does not
+    divide the world's) belongs to the policy's previous step: its reward is added to that step's reward, and the
+    observation is the next step's. Every episode has a random timeline of the graph and random parameters. It is
+    truncated at the policy's last step in the timeline, whose observation is the final one. Actions are clipped to
+    their bounds, as by the gate on the robot.
 
     Attributes:
         env: The environment of the graph's rows.
@@ -88,7 +88,7 @@ class RobotEnvironment:
         self.action = contract.action
         if len(self.observation) != env.observation_size:
             raise UsageError(
-                f"the robot's observation terms have {len(self.observation)} entries, its task shows "
+                f"the robot's observation terms have {len(self.observation)} entries, its task has "
                 f"{env.observation_size}",
                 hint="give each entry a name and a unit in the robot's `observation`",
             )
@@ -119,7 +119,7 @@ class RobotEnvironment:
 
         def play(now: tuple[EnvState, jax.Array], _: None) -> tuple[tuple[EnvState, jax.Array], None]:
             row = self.env.step(now[0], idle, key)
-            # The policy has not acted yet: rewards so far are no part of the episode's return.
+            # The policy has not acted yet: rewards so far do not belong to the episode's return.
             state = row.state._replace(total=now[0].total, good=now[0].good)
             return choose(jnp.asarray(now[0].step_state.seq >= 0), now, (state, row.observation)), None
 
@@ -153,13 +153,13 @@ def specs_of(environment: MjxEnvironment | RobotEnvironment) -> tuple[PyTree, sp
     """Return shape, dtype and bounds of an observation, of a composed task by name, and of an action.
 
     Raises:
-        UsageError: When no observable of a task is enabled, or an action is not one array.
+        UsageError: No observable of a task is enabled, or an action is not one array.
     """
     observation, action = environment.observation_spec(), environment.action_spec()
     if isinstance(environment, MjxEnvironment) and not observation:
         task = environment.task
         raise UsageError(
-            f"task {type(task).__name__} shows its policy nothing: no observable is enabled. There are: "
+            f"task {type(task).__name__} has no observation: no observable is enabled. Available: "
             f"{', '.join(map(repr, task.observables)) or 'none'}",
             hint="set `enabled = True` for the observables of the policy; a robot with its delays comes from "
             "sim2real.interop",

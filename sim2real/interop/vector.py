@@ -35,24 +35,24 @@ if TYPE_CHECKING:
 _SEEDS = 2**32
 _MODES = (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)
 Infos = dict[str, "PyTree"]
-"""Name -> values of the copies, and ``_NAME`` -> mask of the copies that have one."""
+"""Name -> values of the copies, and ``_NAME`` -> mask of the copies that have a value."""
 
 
 class CopiesVectorEnv(VectorEnv):
     """Copies of a composed task, whose observations are dictionaries of observables, or of a robot with its delays.
 
-    With ``AutoresetMode.NEXT_STEP`` a copy that is done is reset at the next step, whose action is ignored and whose
-    reward is 0. With ``SAME_STEP`` it is reset at once; ``infos`` then has ``final_obs`` and ``final_info``.
+    With ``AutoresetMode.NEXT_STEP`` a finished copy is reset at the next step, whose action is ignored and whose reward
+    is 0. With ``SAME_STEP`` it is reset at once; ``infos`` then has ``final_obs`` and ``final_info``.
 
-    Copy i of ``reset(seed=s)`` has the seed s + i, as in gymnasium's own vector environments. The episodes of a copy
-    depend on its seed and its actions alone. At the end of an episode of a robot infos have its ``return`` and
-    ``success``: the share of its second half in which the task was fulfilled.
+    Copy i of ``reset(seed=s)`` has the seed s + i, as in gymnasium's vector environments. The episodes of a copy depend
+    only on its seed and its actions. At the end of an episode of a robot, infos have its ``return`` and ``success``:
+    the share of the second half of the episode in which the task was fulfilled.
 
     Attributes:
         environment: One copy; of a robot, ``environment.observation`` and ``.action`` name each entry.
 
     Raises:
-        UsageError: When ``num_envs`` is below 1, or there is no such mode.
+        UsageError: ``num_envs`` is below 1, or there is no such mode.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class CopiesVectorEnv(VectorEnv):
         return jax.vmap(lambda key: self.environment.reset(key))(keys), next_keys
 
     def _reset_some(self, last: PyTree, keys: jax.Array, mask: jax.Array) -> tuple[PyTree, jax.Array]:
-        """Return the copies, those of the mask at the start of an episode, and the keys for the next ones."""
+        """Return the copies, with those of the mask at the start of an episode, and the keys for the next episodes."""
         fresh, next_keys = self._reset_all(keys)
         return select(mask, fresh, last), select(mask, next_keys, keys)
 
@@ -103,7 +103,7 @@ class CopiesVectorEnv(VectorEnv):
         """Start all copies; return observations and infos.
 
         Raises:
-            UsageError: When there is another number of seeds, or an option, of which there is none.
+            UsageError: The number of seeds is wrong, or options are given, of which there are none.
         """
         super().reset(seed=seed if isinstance(seed, int | np.integer) else None)
         if options:
@@ -119,12 +119,12 @@ class CopiesVectorEnv(VectorEnv):
         """Step all copies; return observations, rewards, terminations, truncations and infos.
 
         Raises:
-            UsageError: Before ``reset``, or when the actions have the wrong shape or are not finite.
+            UsageError: ``reset`` was not called, or the actions have the wrong shape or are not finite.
         """
         if self._last is None:
             raise UsageError("step() was called before reset()", hint="call reset() first")
         last = self._step(self._last, self._checked(actions))
-        if self._done.any():  # those of the step before, in the mode NEXT_STEP
+        if self._done.any():  # copies that finished in the step before, in the mode NEXT_STEP
             last, self._keys = self._restart(last, self._keys, self._done)
         # Copy the results to the host at once; the state stays on the device.
         observation, reward, terminated, truncated, infos, values = jax.device_get(_shown(last))
@@ -132,7 +132,7 @@ class CopiesVectorEnv(VectorEnv):
         everyone = np.ones(self.num_envs, bool)
         of_episode = _masked(values, done) if done.any() else {}
         told = _masked(infos, everyone) | of_episode
-        # Reset the copies that are done now, and keep their last observation.
+        # Reset the copies that have just finished, and keep their last observation.
         if self.autoreset_mode is AutoresetMode.SAME_STEP and done.any():
             final = np.full(self.num_envs, None, object)
             for i in np.flatnonzero(done):
@@ -151,7 +151,7 @@ class CopiesVectorEnv(VectorEnv):
         if array.shape != space.shape:
             raise UsageError(
                 f"actions have shape {array.shape}, {self.num_envs} copies need {space.shape}",
-                hint="one row for each copy, also where there is one copy or one action",
+                hint="one row for each copy, even for one copy or one action",
             )
         if not np.issubdtype(array.dtype, np.number) or np.issubdtype(array.dtype, np.complexfloating):
             raise UsageError(f"actions must be real numbers, got {array.dtype}")
@@ -183,7 +183,7 @@ def _shown(state: PyTree) -> tuple[PyTree, ...]:
 
 
 def _box(spec: PyTree, dtype: npt.DTypeLike) -> gymnasium.spaces.Box:
-    """Return the space of arrays of a spec; a type without bounds has those of its dtype."""
+    """Return the space of a spec; without bounds, the space has the range of the dtype."""
     dtype = np.dtype(dtype)
     if dtype.kind == "b":
         return gymnasium.spaces.Box(0, 1, spec.shape, np.int8)
@@ -193,7 +193,7 @@ def _box(spec: PyTree, dtype: npt.DTypeLike) -> gymnasium.spaces.Box:
         np.broadcast_to(getattr(spec, name, bound), spec.shape)
         for name, bound in zip(("minimum", "maximum"), widest, strict=True)
     )
-    if is_float:  # a bound of 1e10 is dm_env's way to write that there is none
+    if is_float:  # in dm_control, a bound of 1e10 means no bound
         low, high = np.where(low <= -UNLIMITED, -np.inf, low), np.where(high >= UNLIMITED, np.inf, high)
     return gymnasium.spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype.type)
 

@@ -33,10 +33,10 @@ from sim2real.policy.runner import (
 from sim2real.types import Json
 
 FORMAT_VERSIONS = (1, 2)
-"""1: a perceptron whose output is clipped. 2: the file describes the network; a reader of version 1 must refuse it."""
+"""Format versions: 1 is always a perceptron whose output is clipped; in 2, the file describes the network."""
 WEIGHTS, GRAPH, CONTRACT = "policy.safetensors", "policy.onnx", "policy.json"
 SEAL = "sha256"
-"""Entry of ``policy.json``: the hash of all others."""
+"""Entry of ``policy.json`` with the hash of all other entries."""
 PARITY = 1e-5
 """Largest difference between the actions of numpy and ONNX that an export accepts, as a fraction of their range."""
 
@@ -73,13 +73,13 @@ def save_bundle(
 
     Args:
         folder: Created if it does not exist. A bundle in it is replaced.
-        weights: As ``Policy.to_weights`` returns them.
-        samples: Shape ``(n, O)``: observations of one episode, logged ones if possible, for the comparison of numpy and
-            ONNX if onnxruntime is installed. None: those of the references, or else drawn from the normaliser.
+        weights: Result of ``Policy.to_weights``.
+        samples: Shape ``(n, O)``: observations of one episode, logged if possible, on which numpy and ONNX are compared
+            if onnxruntime is installed. None: from the references, or else drawn from the normaliser.
         spec: Default: a perceptron whose output is clipped.
         graph: The policy as an ONNX model, for a network that is not in ``BUILT_IN``.
-        references: Source of the observations, such as ``log`` -> JAX's actions; the runner is compared with them, and
-            ``policy.json`` has the differences.
+        references: Source of observations, such as ``log`` -> observations and JAX's actions, with which the runner is
+            compared; ``policy.json`` gets the differences.
 
     Raises:
         Sim2RealError: Weights and contract do not fit each other, or the runner, ONNX and JAX give different actions.
@@ -115,7 +115,7 @@ def save_bundle(
 
 
 def sealed(about: Mapping[str, Json]) -> dict[str, Json]:
-    """Return the content of ``policy.json`` with the hash of all other entries; the file's layout has no effect."""
+    """Return the content of ``policy.json`` with the hash of all other entries; whitespace has no effect."""
     entries = {name: value for name, value in about.items() if name != SEAL}
     return entries | {SEAL: hashlib.sha256(json.dumps(entries, sort_keys=True).encode()).hexdigest()}
 
@@ -159,7 +159,7 @@ def make_runner(
     spec: NetworkSpec | None = None,
     graph: bytes | None = None,
 ) -> PolicyRunner:
-    """Return the runner of a policy that was not saved; the arguments are those of ``load_bundle`` and ``save_bundle``.
+    """Return the runner of a policy that was not saved; arguments as in ``load_bundle`` and ``save_bundle``.
 
     Raises:
         UsageError: The backend is unknown, not installed or does not run this network.
@@ -179,7 +179,7 @@ def make_runner(
 def _graph_of(
     weights: Mapping[str, np.ndarray], contract: PolicyContract, spec: NetworkSpec, graph: bytes | None
 ) -> bytes:
-    """Return the policy as an ONNX model with the contract's names; ``graph``: that of a user's network."""
+    """Return the policy as an ONNX model with the contract's names; ``graph``: the model of a user's network."""
     if (graph is None) != spec.built_in:
         raise UsageError(
             f"network {spec.name!r} needs {'no ONNX model' if spec.built_in else 'an ONNX model'} of its own"
@@ -202,10 +202,10 @@ def read_contract(folder: str | Path) -> tuple[PolicyContract, NetworkSpec]:
     contract = PolicyContract.from_dict(about)
     spec = NetworkSpec() if about["format_version"] == 1 else NetworkSpec.from_dict(about.get("network"))
     _check_fit(read_weights(folder), contract, spec)
-    # Last, as the errors above name the entry. Bundles of older versions have no hash.
+    # Check this last, because the errors above name the entry. Bundles of older versions have no hash.
     if SEAL in about and about[SEAL] != sealed(about)[SEAL]:
         raise Sim2RealError(
-            f"{Path(folder) / CONTRACT} is not what was exported: its entries do not have the hash in its {SEAL!r}",
+            f"{Path(folder) / CONTRACT} was changed after the export: its entries do not have the hash in its {SEAL!r}",
             hint="copy or export the whole bundle again; a changed contract needs a policy that is trained for it",
         )
     return contract, spec
@@ -243,7 +243,7 @@ def _read_about(folder: Path) -> dict[str, Json]:
         ) from error
     except OSError as error:
         raise Sim2RealError(f"{path} cannot be read: {error.strerror}", hint="check its permissions") from error
-    except (ValueError, RecursionError) as error:  # a decoder's errors are ValueErrors
+    except (ValueError, RecursionError) as error:  # errors of decoders are ValueErrors
         raise Sim2RealError(f"{path} is no JSON: {error}", hint="copy or export the bundle again") from error
     # Check its version, and its list of files.
     version = about.get("format_version") if isinstance(about, dict) else None
@@ -253,7 +253,7 @@ def _read_about(folder: Path) -> dict[str, Json]:
             hint="export the policy again, or install the sim2real that wrote it (see 'versions' in the file)",
         )
     if not isinstance(about.get("files"), dict):
-        raise Sim2RealError(f"{path} does not say which files are its own", hint="copy or export the bundle again")
+        raise Sim2RealError(f"{path} does not list the bundle's files", hint="copy or export the bundle again")
     return about
 
 
@@ -286,7 +286,7 @@ def _shapes(
     expected = {"mean": (size,), "std": (size,), "low": (actions,), "high": (actions,), "log_std": (actions,)}
     if not spec.built_in:
         return {name: weights[name].shape for name in weights} | expected
-    # The recurrent unit, then the layers behind it.
+    # The recurrent unit, then the layers after it.
     width = size
     if spec.name == "gru":
         width = gru_of(weights)["recurrent"].shape[0]
@@ -310,11 +310,11 @@ def _check_fit(weights: Mapping[str, np.ndarray], contract: PolicyContract, spec
                 hint=f"the contract has {size} observations and {actions} actions: describe the ones that were trained",
             )
         if not np.isfinite(weights[name]).all():
-            raise Sim2RealError(f"the policy's {name} holds values that are not finite", hint="train the policy again")
+            raise Sim2RealError(f"the policy's {name} has values that are not finite", hint="train the policy again")
         if np.abs(weights[name]).max(initial=0.0) > MAX_WEIGHT:
             raise Sim2RealError(
                 f"the policy's {name} holds values up to {np.abs(weights[name]).max():.3g}; {MAX_WEIGHT:g} is the most",
-                hint="no training ends there: train the policy again, and scale observations that are this large",
+                hint="such weights mean a failed training: train the policy again, and scale large observations",
             )
     smallest = weights["std"].min()
     if smallest < MIN_STD:
@@ -335,7 +335,7 @@ def _parity(
     runner.reset()
     actions = np.array([runner(observation) for observation in reference.observations])
     difference = np.abs((actions - reference.actions) / (weights["high"] - weights["low"]))
-    if not difference.max(initial=0.0) <= PARITY:  # a NaN is no parity
+    if not difference.max(initial=0.0) <= PARITY:  # also fails for NaN
         raise Sim2RealError(
             f"the runner disagrees with JAX by {difference.max():.2e} of the action range on observations of the "
             f"{name}, {PARITY:.0e} is allowed",

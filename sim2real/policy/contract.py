@@ -1,4 +1,4 @@
-"""The contract of a policy: its observations, actions, rate and limits; and the description of its network."""
+"""The contract of a policy (observations, actions, rate, limits), and the description of its network."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class ObservationTerm:
 
     Attributes:
         units: The unit of each entry, e.g. ``("1", "1", "rad/s")``; ``"1"``: no unit.
-        history: Number of steps in the vector, newest step first.
+        history: Number of steps in the vector, the newest step first.
         low: Lower bound of each entry [its unit]; empty: unknown. Observations are not clipped to it.
         high: Upper bound of each entry [its unit]; empty: unknown.
     """
@@ -84,7 +84,7 @@ class ActionTerm:
     """One entry of the action vector.
 
     Attributes:
-        unit: ``"1"``: none.
+        unit: ``"1"``: no unit.
         low: Lower bound [unit].
         high: Upper bound [unit].
     """
@@ -104,7 +104,7 @@ class ActionTerm:
 
 @dataclasses.dataclass(frozen=True)
 class PolicyContract:
-    """The inputs and outputs of a policy, and the conditions that it was trained for.
+    """The inputs and outputs of a policy, and the conditions for which it was trained.
 
     Attributes:
         observation: The terms of the observation vector in their order.
@@ -116,7 +116,7 @@ class PolicyContract:
             delays, or they are unknown.
         limits: Name -> limit that must hold while it runs, e.g. ``{"thdot_rad_s": 40.0}``.
         hashes: Name -> sha256 of the input files of the training, e.g. the log and the identified parameters.
-        robot: Name of the pipeline that it was trained for; "": unknown.
+        robot: Name of the pipeline for which it was trained; "": unknown.
         port: Port of the robot whose recording was identified, such as ``embedded``; "": none, or unknown.
     """
 
@@ -199,7 +199,7 @@ class NetworkSpec:
 
     Attributes:
         name: ``"mlp"``, ``"gru"``, or ``"package.module:Class"`` of a user's network.
-        squash: Whether the action is bounded by tanh; else it is clipped.
+        squash: Whether tanh bounds the action; otherwise it is clipped.
     """
 
     name: str = "mlp"

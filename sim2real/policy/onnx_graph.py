@@ -16,14 +16,14 @@ if TYPE_CHECKING:
     from onnx import NodeProto, ValueInfoProto
 
 OPSET = 17
-IR_VERSION = 8  # that of the ONNX release with opset 17, not the newest, so that older runtimes on a robot load it
+IR_VERSION = 8  # the version of the ONNX release with opset 17, so that older runtimes on a robot load the file
 
 
 def build_onnx(weights: Mapping[str, np.ndarray], contract: PolicyContract, spec: NetworkSpec | None = None) -> bytes:
     """Return the serialised model: ``observation (1, O)`` -> ``action (1, A)``, float32.
 
-    The batch axis is needed as ONNX's Gemm takes only matrices. A recurrent network also has an input ``carry_0`` and
-    an output ``next_carry_0``.
+    The batch axis is needed because ONNX's Gemm takes only matrices. A recurrent network also has an input ``carry_0``
+    and an output ``next_carry_0``.
 
     Args:
         spec: One of the networks in ``BUILT_IN``; default: a perceptron whose output is clipped.
@@ -49,7 +49,7 @@ def build_onnx(weights: Mapping[str, np.ndarray], contract: PolicyContract, spec
         helper.make_node("Clip", ["scaled", "clip_low", "clip_high"], ["x0" if spec.name == "mlp" else "x"]),
     ]
 
-    # The network: a gated recurrent unit in place of the first layer, then tanh layers and a linear one.
+    # The network: perhaps a gated recurrent unit as the first layer, then tanh layers and a linear layer.
     initial = []
     if spec.name == "gru":
         gru = gru_of(weights)
@@ -73,7 +73,7 @@ def build_onnx(weights: Mapping[str, np.ndarray], contract: PolicyContract, spec
         helper.make_node("Add", ["stretched", "low"], ["action"]),
     ]
 
-    # The carry is an input and an output of the graph; its first value is in the model's properties.
+    # The carry is an input and an output of the graph; its initial value is in the model's metadata.
     def described(name: str, size: int) -> ValueInfoProto:
         return helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, size])
 
@@ -107,7 +107,7 @@ def with_contract(graph: bytes, contract: PolicyContract) -> bytes:
 
 
 def comma_list(names: Iterable[str]) -> str:
-    """Return names as other programs read them from a policy: between commas. A comma in a name becomes a semicolon."""
+    """Join names by commas, as other programs read them; a comma in a name becomes a semicolon."""
     return ",".join(name.replace(",", ";") for name in names)
 
 

@@ -16,10 +16,10 @@ OBSERVATION_CLIP = 10.0
 """Normalised observations are clipped to this many standard deviations, which is part of the bundle's format."""
 
 INITIAL_CARRY = "initial_carry"
-"""Entry of an ONNX file's metadata: the carry into an episode's first step, a list of arrays as JSON."""
+"""Entry of an ONNX file's metadata with the carry at an episode's start: a list of arrays as JSON."""
 BACKENDS = ("numpy", "onnx")
 BESIDES = ("log_std", "mean", "std", "low", "high")
-"""Arrays of a policy besides those of its network."""
+"""Arrays of a policy that do not belong to its network."""
 PARTS, GRU_ARRAYS = ("kernel", "bias"), ("kernel", "recurrent", "bias")
 """Arrays of a layer, and of a gated recurrent unit: ``gru.kernel``, ..."""
 
@@ -30,7 +30,7 @@ class Backend(Protocol):
     """Maps a finite observation, float32 of shape ``(1, O)``, to an action, shape ``(1, A)``."""
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Return the action; a recurrent network continues from the call before."""
+        """Return the action; a recurrent network continues from the previous call."""
         ...
 
     def reset(self) -> None:
@@ -53,7 +53,7 @@ def gru_of(weights: Mapping[str, T]) -> dict[str, T]:
     """Return the arrays of the gated recurrent unit by their names in ``GRU_ARRAYS``.
 
     Raises:
-        Sim2RealError: One is missing.
+        Sim2RealError: An array is missing.
     """
     require(weights, [f"gru.{name}" for name in GRU_ARRAYS])
     return {name: weights[f"gru.{name}"] for name in GRU_ARRAYS}
@@ -110,7 +110,7 @@ def _gru_step(gru: Mapping[str, np.ndarray], carry: np.ndarray, x: np.ndarray) -
 
 
 def onnx_session(model: bytes) -> Any:
-    """Return onnxruntime's session of a model, on one thread: the policy is small, and the control loop has one core.
+    """Return onnxruntime's session of a model, on one thread, as the policy is small and the control loop has one core.
 
     Raises:
         UsageError: onnxruntime is not installed.
@@ -128,7 +128,7 @@ def onnx_session(model: bytes) -> Any:
     options.log_severity_level = 3
     try:
         return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # its errors share no public base class
+    except Exception as error:  # errors of onnxruntime have no common public base class
         raise Sim2RealError(f"onnxruntime cannot load the policy: {error}") from error
 
 
@@ -196,13 +196,13 @@ class PolicyRunner:
             terms = ", ".join(f"{term.name} {term.history}x{term.size}" for term in self.contract.observation)
             raise Sim2RealError(
                 f"the observation has shape {values.shape}, the policy expects ({size},): {terms}",
-                hint="build the observation as the training did: same terms, same order, same history",
+                hint="build the observation as in training: same terms, same order, same history",
             )
         if not np.isfinite(values).all():
             names = [self.contract.observation_names[i] for i in np.flatnonzero(~np.isfinite(values))]
             raise SafetyStop(f"observation {', '.join(names)} is not finite", hint="check the sensor that feeds it")
 
-        # Compute the action, and clip it: an ONNX file may come from another exporter, without bounds.
+        # Compute the action, and clip it: an ONNX file of another exporter may not bound it.
         action = self._backend(values[None])[0]
         if not np.isfinite(action).all():
             names = [term.name for term, ok in zip(self.contract.action, np.isfinite(action), strict=True) if not ok]
@@ -211,7 +211,7 @@ class PolicyRunner:
 
 
 class Runner(Protocol):
-    """What acts in an episode: ``PolicyRunner``, or one around it."""
+    """Computes the actions of an episode: a ``PolicyRunner``, or a wrapper of one."""
 
     def reset(self) -> None:
         """Begin an episode."""

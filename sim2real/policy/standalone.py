@@ -1,4 +1,4 @@
-"""Run this policy with numpy alone: `python run_policy.py`. Its observation, action and rate: policy.json."""
+"""Runs this policy with numpy: `python run_policy.py`. policy.json describes observation, action and rate."""
 
 import hashlib
 import json
@@ -8,13 +8,13 @@ import numpy as np
 
 
 class BarePolicy:
-    """Observation ``(O,)`` -> action ``(A,)``, of the bundle in a folder. Send no action that is not finite."""
+    """The policy of a bundle: observation ``(O,)`` -> action ``(A,)``. Do not send an action that is not finite."""
 
     def __init__(self, folder: Path) -> None:
         about, raw = json.loads((folder / "policy.json").read_text()), (folder / "policy.safetensors").read_bytes()
         entries = {name: value for name, value in about.items() if name != "sha256"}
         seal = hashlib.sha256(json.dumps(entries, sort_keys=True).encode()).hexdigest()
-        if about.get("sha256", seal) != seal:  # bundles of older versions have no such hash
+        if about.get("sha256", seal) != seal:  # bundles of older versions have no hash
             raise ValueError("policy.json was changed: its hash differs from its sha256")
         if hashlib.sha256(raw).hexdigest() != about["files"]["policy.safetensors"]:
             raise ValueError("policy.safetensors was changed: its hash differs from the one in policy.json")
@@ -24,7 +24,9 @@ class BarePolicy:
         layers = range(sum("layers." in name for name in tensors) // 2)
         *self.hidden, self.out = [[self.w.pop(f"layers.{i}.{part}") for part in ("kernel", "bias")] for i in layers]
         if about["format_version"] != 1 or set(self.w) != {"log_std", "mean", "std", "low", "high"}:
-            raise ValueError(f"no clipped tanh layers alone, but {sorted(self.w)}: run policy.onnx with onnxruntime")
+            raise ValueError(
+                f"numpy runs clipped tanh layers alone, not {sorted(self.w)}: run policy.onnx with onnxruntime"
+            )
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         x = np.clip((np.asarray(observation, np.float32) - self.w["mean"]) / self.w["std"], -self.clip, self.clip)

@@ -1,1 +1,1 @@
-"""Policies from graphs: the environment that PPO trains on, PPO, the policy."""
+"""Trains policies: environments made of graphs, PPO, and networks."""

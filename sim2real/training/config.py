@@ -21,7 +21,8 @@ class PPOConfig:
     """Number of copies of the environment per seed."""
     eval_envs: int | None = None
     """Number of copies that play one episode each in an evaluation; default: num_envs, which needs no further
-    compilation. With thousands of copies on a GPU, 256 save most of the evaluations' time."""
+    compilation. With thousands of copies on a GPU, 256 save most of the time of evaluations.
+    """
     rollout_steps: int = 32
     """Number of rows (environment steps) that each copy plays between two updates."""
     total_steps: int = 1_000_000
@@ -30,8 +31,9 @@ class PPOConfig:
     """Success, 0 to 1, at which training ends: at the first evaluation in which the best seed reaches it; default:
     train to the end."""
     minutes: float | None = None
-    """Time after which training ends, compilation included: at the first evaluation behind it [min]; default: no limit.
-    The schedule of the step size stays that of total_steps."""
+    """Time after which training ends, at the next evaluation, compilation included [min]; default: no limit. The
+    schedule of the step size still refers to total_steps.
+    """
     epochs: int = 4
     """Number of passes over the rows of a rollout in one update."""
     minibatches: int = 32
@@ -39,11 +41,12 @@ class PPOConfig:
     learning_rate: float = 2e-3
     """Adam's step size at the start."""
     schedule: Literal["linear", "adaptive"] = "linear"
-    """Schedule of the step size. 'linear': down to 5 % of learning_rate. 'adaptive': after each minibatch divided by
-    1.5 if the KL divergence from the policy that played exceeds twice target_kl, multiplied by 1.5 if it is below half
-    of target_kl, within 1e-5 and 1e-2."""
+    """Schedule of the step size. 'linear': falls to 5 % of learning_rate. 'adaptive': divided by 1.5 after a minibatch
+    if the KL divergence from the policy that played exceeds twice target_kl, multiplied by 1.5 if it is below half of
+    target_kl; within 1e-5 and 1e-2.
+    """
     target_kl: float = 0.01
-    """KL divergence from the policy that played, within an update, for an adaptive step size [nat]."""
+    """Desired KL divergence from the policy that played, within an update, for an adaptive step size [nat]."""
     gamma: float = 0.99
     """Discount per policy step."""
     gae_lambda: float = 0.95
@@ -57,12 +60,11 @@ class PPOConfig:
     value_coef: float = 0.5
     """Weight of the value loss."""
     max_grad_norm: float = 0.5
-    """Largest norm of a gradient; longer ones are scaled down to it."""
+    """Largest norm of a gradient; longer gradients are scaled down."""
     reward_scale: float = 0.05
     """Factor on the reward during training; it should bring discounted returns near 1 to 50."""
     hidden: tuple[int, ...] = (64, 64)
-    """Widths of the hidden layers of actor and value network; of a gru the unit's width, then those of the layers after
-    it."""
+    """Widths of the hidden layers of actor and value network; for a gru, the width of the unit comes first."""
     network: str = "mlp"
     """Actor and value network: 'mlp', a perceptron; 'gru', a recurrent network; or package.module:Class of a module of
     flax.linen or a Network of your own."""
@@ -71,8 +73,9 @@ class PPOConfig:
     squash: bool = False
     """Bound actions by tanh, a squashed Gaussian; default: clip them, which reaches full actions sooner."""
     privileged: bool = False
-    """Give the value function the world's true state and the episode's parameters besides the observation. Only the
-    policy, which gets the observation alone, runs on the robot."""
+    """Also give the value function the world's true state and the episode's parameters. The policy, which alone runs on
+    the robot, gets only the observation.
+    """
     log_std_init: float = -0.5
     """Logarithm of the exploration noise at the start, in units of half the action range."""
     evaluations: int = 10
@@ -80,7 +83,9 @@ class PPOConfig:
     devices: int = 1
     """Number of this host's devices that share seeds and copies; the results are the same."""
     eval_steps: int = 250
-    """Rows of an evaluation; no episode may be longer. The first training episodes are staggered over as many rows."""
+    """Number of rows of an evaluation; no episode may be longer. The first episodes of training are staggered over
+    them.
+    """
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):

@@ -1,4 +1,4 @@
-"""A grid of settings that are trained side by side in one program, each with every seed. Imports no JAX, nor numpy."""
+"""A grid of settings that are trained in parallel in one program, each with every seed. Imports no JAX."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from sim2real.types import Array
 
 SWEPT = tuple(f.name for f in fields(PPOConfig) if type(f.default) is float)
-"""Settings that are numbers in the program. The others set its shapes or its parts."""
+"""Settings that are numbers in the program. Other settings determine its shapes or its structure."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Sweep:
 
     @staticmethod
     def parse(texts: Sequence[str]) -> Sweep:
-        """Return the grid of texts such as ``learning_rate=1e-3,3e-3``, one for each setting.
+        """Parse texts such as ``learning_rate=1e-3,3e-3``, one for each setting.
 
         Raises:
             UsageError: A setting cannot be swept, or a value is no number.
@@ -47,12 +47,14 @@ class Sweep:
             if not sign or len(set(numbers)) < len(numbers) or name in values:
                 raise UsageError(
                     f"sweep {text!r} is no list of different numbers for one setting",
-                    hint="write NAME=VALUE,VALUE..., one --sweep a setting, such as --sweep learning_rate=1e-3,3e-3",
+                    hint="write NAME=VALUE,VALUE..., one --sweep for each, such as --sweep learning_rate=1e-3,3e-3",
                 )
             if name not in SWEPT:
                 exists = any(f.name == name for f in fields(PPOConfig))
                 reason = "sets the shape or the parts of the program" if exists else "is no setting of PPO"
-                raise UsageError(f"{name} cannot be swept: it {reason}", hint=f"settings that can: {', '.join(SWEPT)}")
+                raise UsageError(
+                    f"{name} cannot be swept: it {reason}", hint=f"settings that can be swept: {', '.join(SWEPT)}"
+                )
             values[name] = numbers
         return Sweep(values)
 
@@ -74,12 +76,12 @@ class Sweep:
             UsageError: A value is out of its range, or has no effect.
         """
         if "target_kl" in self.values and config.schedule != "adaptive":
-            raise UsageError("target_kl does nothing with a linear step size", hint="add --ppo.schedule adaptive")
+            raise UsageError("target_kl has no effect with a linear step size", hint="add --ppo.schedule adaptive")
         return [replace(config, **point) for point in self.grid]
 
 
 def format_point(point: Mapping[str, float]) -> str:
-    """Return a point of the grid as a text, such as ``learning_rate=0.001``."""
+    """Return a point of the grid as text, such as ``learning_rate=0.001``."""
     return ", ".join(f"{name}={value:g}" for name, value in point.items())
 
 

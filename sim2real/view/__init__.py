@@ -1,1 +1,1 @@
-"""Looking at a run: figures, an HTML report that needs no network, and a Rerun recording."""
+"""Shows a run: figures, an HTML report that needs no network, and a Rerun recording."""

@@ -17,7 +17,7 @@ Tone = Literal["good", "doubt", "bad"]
 MARKS: Mapping[Tone, str] = {"good": "✓", "doubt": "!", "bad": "✗"}
 _SVG_WIDTH = re.compile(r'<svg[^>]* width="([\d.]+)pt"')
 _WIDE_PT = 400.0
-"""A figure up to this width has letters of at least 7 px on a screen of 390 px."""
+"""A figure up to this width [px] has letters of at least 7 px on a screen of 390 px."""
 _NUMBER = re.compile(r"[+-]?\d+(\.\d+)? ?%?")
 
 
@@ -35,7 +35,7 @@ class FigureBlock:
 
     @property
     def layout(self) -> str:
-        """Class for the style: on a telephone a ``wide`` figure scrolls, and any other one is scaled to fit."""
+        """CSS class: on a telephone a ``wide`` figure scrolls, and any other figure is scaled to fit."""
         drawn = _SVG_WIDTH.search(self.svg)
         return "wide" if drawn is not None and float(drawn[1]) > _WIDE_PT else "small"
 
@@ -46,7 +46,7 @@ class TableBlock:
 
     Attributes:
         columns: Headers of the columns.
-        rows: Cells as text; the first of each row is its header.
+        rows: Cells as text; the first cell of each row is its header.
         text_columns: Indices of columns with text, which are aligned left.
         remarks: A remark for each row, in small letters below its header.
         folded: Whether it is collapsed at first.
@@ -74,7 +74,7 @@ class TableBlock:
         units = [header == "unit" for header in table.headers]
         readable = [_in_ms(row, units) for row in table.rows]
         rows = [[cell_text(cell, unit) for cell, unit in zip(row, units, strict=True)] for row in readable]
-        # A cell is aligned left if it is text; a number with decimals that its artifact chose is none.
+        # Text is aligned left; a number that its artifact has formatted counts as a number.
         is_text = lambda cell: isinstance(cell, bool) or (isinstance(cell, str) and not _NUMBER.fullmatch(cell))  # noqa: E731
         text = [i for i, column in enumerate(zip(*table.rows, strict=True)) if i and any(map(is_text, column))]
         return TableBlock(caption, [_with_minus(header) for header in table.headers], rows, text)
@@ -134,7 +134,7 @@ class Tile:
 
 @dataclass(frozen=True)
 class PageSection:
-    """One stage's part of a page; it opens with the banner and, beside it, the figure."""
+    """The section of one stage; it begins with the banner and the figure."""
 
     id: str
     title: str
@@ -146,7 +146,7 @@ class PageSection:
 
     @property
     def box(self) -> Banner:
-        """The verdict with its first reason, for the head of the page; without a verdict the first number."""
+        """The verdict with its first reason, for the head of the page; without a verdict, the first number."""
         if self.banner is not None:
             return replace(self.banner, reasons=self.banner.reasons[:1])
         return Banner("doubt", "no verdict", [f"{tile.label} {tile.value}" for tile in self.tiles[:1]])
@@ -177,7 +177,7 @@ def cell_text(cell: Cell, unit: bool = False) -> str:
 
 
 def _in_ms(row: Sequence[Cell], units: Sequence[bool]) -> Sequence[Cell]:
-    """Return a row in ms if its unit is s and its numbers are below 1; rows without numbers are unchanged, too."""
+    """Return a row in ms if its unit is s and its numbers are below 1; other rows are unchanged."""
     if "s" not in [cell for cell, unit in zip(row, units, strict=True) if unit]:
         return row
     numbers = [x for cell in row for x in (_ends(cell) if isinstance(cell, Interval) else (cell,))]

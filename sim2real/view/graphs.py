@@ -51,11 +51,11 @@ def plot_timeline(
         order: The nodes from top to bottom; default: as in the timeline.
 
     Returns:
-        A bar for each step, a line for each message from its sending to its arrival, and a dotted line on to the start
-        of the step that uses it.
+        A bar for each step, a line for each message from its sending to its arrival, and a dotted line to the start of
+        the step that uses it.
 
     Raises:
-        UsageError: When the episode, a node or the interval does not exist.
+        UsageError: The episode, a node or the interval does not exist.
     """
     if not 0 <= episode < timeline.episodes:
         raise UsageError(f"there is no episode {episode}: the timeline has {timeline.episodes}")
@@ -98,8 +98,8 @@ def plot_timeline(
 def plot_graph(nodes: Mapping[str, BaseNode] | Sequence[BaseNode]) -> Picture:
     """Draw the nodes of a graph with their rates, and the connections with their options.
 
-    Senders are left of their readers, unless ``order`` differs. A dashed arrow is a skipped connection, a thick one
-    blocks.
+    Senders are left of their readers, unless ``order`` differs. A dashed arrow is a skipped connection, a thick arrow a
+    blocking one.
     """
     by_node = by_name(nodes)
     names = topological(by_node)
@@ -149,7 +149,7 @@ def _draw_connection(axes: Axes, begin: float, end: float, number: int, connecti
 def draw_messages(
     axes: Axes, rows: tuple[float, float], sent: np.ndarray, received: np.ndarray, used: np.ndarray, color: str = ORANGE
 ) -> None:
-    """Draw messages ``(N,)`` in a schedule: a line from sending to arrival, dotted on to the step that reads it.
+    """Draw messages ``(N,)``: a line from sending to arrival, then a dotted line to the step that reads it.
 
     Args:
         rows: Heights of the sender and of the reader.

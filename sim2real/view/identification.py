@@ -34,10 +34,10 @@ from sim2real.view.panels import Line, Panel, compared, over_time, with_gaps, wi
 
 _TONES: dict[str, Tone] = {"accepted": "good", "change the model": "bad"}
 _MOST_COMPARED = 12
-"""Rows of errors beside the expected ones that are not folded."""
+"""Number of rows of errors that are not collapsed."""
 _MAX_PANELS = 6
 _MOST_JOINTS = 6
-"""Joints whose expected errors are not folded."""
+"""Number of joints whose expected errors are not collapsed."""
 _AROUND_S = 1.0
 """Time that is drawn before and after the worst second [s]."""
 
@@ -100,7 +100,7 @@ def worst_figure(result: Identification, name: str) -> FigureBlock | None:
     worst, s = result.worst, result.samples
     if worst is None or not {"worst", f"{worst.field}_identified"} <= set(s):
         return None
-    # The segment of the worst second comes first, then those around it that do not overlap it.
+    # The segment of the worst second, then segments around it that do not overlap it.
     begin_s, end_s = worst.begin_s - _AROUND_S, worst.end_s + _AROUND_S
     inside = s["segment"] == s["segment"][s["worst"]][0]
     first_s, last_s = float(s["t"][inside].min()), float(s["t"][inside].max())
@@ -130,7 +130,7 @@ def worst_figure(result: Identification, name: str) -> FigureBlock | None:
 
 
 def _parameter_table(result: Identification) -> TableBlock:
-    """Return the table of the console, with what each parameter is."""
+    """Return the table of parameters of the console, with descriptions."""
     table = TableBlock.of("Parameters", result.rows())
     meanings = {e.name: pretty_unit(e.about) if e.about else "" for e in result.parameters}
     return replace(table, remarks=[meanings[row[0]] for row in table.rows])
@@ -157,7 +157,7 @@ def link_blocks(links: Sequence[Link]) -> list[Block]:
 
 
 def _expected(result: Identification) -> list[Block]:
-    """Return the expected errors, and the errors on held-out parts beside them, the largest ratios first."""
+    """Return tables of the expected errors, and of the errors on held-out parts, the largest ratios first."""
     known = {(e.joint, e.how): e for e in result.expected_error}
     joints, kinds = (list(dict.fromkeys(key[i] for key in known)) for i in (0, 1))
     rows = [
@@ -167,7 +167,7 @@ def _expected(result: Identification) -> list[Block]:
     lead = TableBlock.of(
         "Expected errors, for motion like the fitted one", ArtifactTable(("joint", *kinds, "unit"), rows)
     )
-    # The verdict has those of a single joint.
+    # With a single joint, the verdict has the errors already.
     blocks: list[Block] = [replace(lead, folded=len(joints) > _MOST_JOINTS)] if len(joints) > 1 else []
     caption = "Errors on held-out parts beside the expected errors and baselines"
     table = TableBlock.of(caption, compared_table(result.judged))
@@ -180,7 +180,7 @@ def _expected(result: Identification) -> list[Block]:
 
 
 def _free_runs(result: Identification) -> list[Block]:
-    """Return the figure of the held-out parts, each recording in one simulation; nothing without free runs."""
+    """Return the figure of the free runs; nothing without free runs."""
     if not result.free:
         return []
     recordings = np.unique(result.free["recording"]).tolist()
@@ -191,7 +191,7 @@ def _free_runs(result: Identification) -> list[Block]:
 
 
 def free_runs_svg(result: Identification, name: str) -> str:
-    """Draw the held-out part of each log, and one simulation of all of it with its errors."""
+    """Draw the held-out part of each log, its free run, and the error."""
     panels = []
     for recording, field in _panels(result, np.unique(result.free["recording"]).tolist()):
         rows = result.free["recording"] == recording

@@ -1,6 +1,6 @@
-"""A live view: follows the growing logs of one or more stages, and sends new rows to a Rerun recording.
+"""A live view: follows the growing logs of stages, and sends new rows to a Rerun recording.
 
-Of a log it sends at most 50 rows a second, and of each group of steps the latest one.
+It sends at most 50 rows per second of a log: of each group of steps, the one with the largest lateness.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ PERIOD_S = 0.2
 ROWS_PER_S = 50.0
 """Largest number of rows that a viewer gets for each node [1/s]."""
 RECENT_S = 10.0
-"""Part before the newest data that the plots show [s]."""
+"""Time before the newest data that the plots show [s]."""
 _PATIENCE_S = 0.5
 """The viewer is behind if it does not take the rows of one round within this time [s]; then rows are dropped."""
 
@@ -33,7 +33,8 @@ _PATIENCE_S = 0.5
 class Follower:
     """Sends the logs of stages to a viewer as they grow.
 
-    A viewer that takes no data gets none until it has taken the last rows, so the memory of this process stays small.
+    While a viewer does not take the last rows, no further rows are sent, so that the memory of this process stays
+    small.
 
     Args:
         recording: A ``rerun.RecordingStream`` with a viewer.
@@ -69,7 +70,7 @@ class Follower:
         return self._dropped + (not self._flushed())
 
     def _send(self, path: Path, tab: Tab) -> None:
-        # Arrange the viewer for a tab with new curves.
+        # Arrange the viewer again if a tab has new curves.
         curves = {c.entity for plot in tab.plots.values() for c in plot}
         if not curves <= self._curves.get(path, set()):
             self._curves[path], self._tabs[path] = curves, tab
@@ -96,21 +97,21 @@ class Follower:
         return True
 
     def _offset_s(self, epoch_ns: int) -> float:
-        """Return by how much a log begins after the first one [s]."""
+        """Return the time from the begin of the first log to the begin of this one [s]."""
         if self._first_ns is None:
             self._first_ns = epoch_ns
         return (epoch_ns - self._first_ns) / 1e9
 
 
 class _StaticOnce:
-    """A recording that gets static data of an entity once: shapes and styles are logged with each part of a motion."""
+    """Sends static data of an entity once, although shapes and styles are logged with each part of a motion."""
 
     def __init__(self, recording: Any) -> None:
         self._recording = recording
         self._logged: set[tuple[str, type]] = set()
 
     def log(self, entity: str, data: Any, static: bool = False) -> None:
-        """Log data; static data only if the entity has none of its kind."""
+        """Log data; static data only if the entity has none of this type yet."""
         key = (entity, type(data))
         if not (static and key in self._logged):
             self._recording.log(entity, data, static=static)
@@ -126,7 +127,8 @@ class LogSource:
 
     Args:
         entity: Prefix of its entities.
-        offset_s: Returns the begin of a log on the live view's timeline [s], from its wall clock at time 0 [ns].
+        offset_s: Returns the begin of a log on the live view's timeline [s], given the wall clock at the log's time 0
+            [ns].
     """
 
     def __init__(self, path: Path, entity: str, offset_s: Callable[[int], float]) -> None:
@@ -139,7 +141,7 @@ class LogSource:
             return None
         thinned, lateness = _thinned(episode)
         tab = episode_tab(self._entity, self._entity, outputs_of(thinned), [])
-        # Of each group of steps the latest one goes into the last plot.
+        # The last plot gets the latest step of each group.
         curves = [
             Curve(f"{self._entity}/lateness/{node}", node, "", steps.woken / TICKS_PER_S, lateness[node])
             for node, steps in thinned.steps.items()

@@ -1,4 +1,4 @@
-"""A robot's MuJoCo model in the 3-D view: its geometries on bodies that move as the measured joints do."""
+"""A robot's MuJoCo model in the 3-D view, moved by the measured joint positions."""
 
 import importlib
 from collections.abc import Mapping
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 _GROUPS = (0, 1, 2)
-"""Groups of geometries that MuJoCo's viewer shows; by convention the others are for collisions."""
+"""Groups of geometries that are drawn; by convention, other groups are for collisions."""
 _ABOVE_M = 10.0
 """Height from which a robot is lowered to the floor [m]."""
 _GHOST, _PLAIN = (66, 150, 230), (150, 162, 176)
@@ -16,13 +16,13 @@ _GHOST, _PLAIN = (66, 150, 230), (150, 162, 176)
 class ModelScene:
     """Draws a model over time; a ``Scene``.
 
-    A floating base turns as the fields ``quaternion[i]`` do, and is at ``base[i]`` [m]. Without these it is above the
-    origin, and the lowest part of the robot on the floor.
+    A floating base has the orientation ``quaternion[i]`` and the position ``base[i]`` [m] of the columns. Without these
+    it is above the origin, with the lowest part of the robot on the floor.
 
     Args:
         mjcf: The model, or the path of its file.
-        columns: Joint, or its actuator -> field of its measured position (``"position[0]"``). A composed model names a
-            joint by the path of its parts, ``arm/elbow/joint``; then the name before ``joint`` counts.
+        columns: Joint, or its actuator -> field of its measured position (``"position[0]"``). For a joint of a composed
+            model, such as ``arm/elbow/joint``, ``elbow`` is also accepted.
     """
 
     def __init__(self, mjcf: str, columns: Mapping[str, str]) -> None:
@@ -81,7 +81,7 @@ class ModelScene:
     def _move_base(self, columns: Mapping[str, np.ndarray], row: int, ghost: bool) -> None:
         """Place a floating base by a row of the columns, otherwise on the floor.
 
-        A ghost stays beside the robot, whose way is not measured.
+        A ghost stays next to the robot, because the robot's way is not measured.
         """
         if self._base is None or "quaternion[0]" not in columns:
             return
@@ -98,7 +98,7 @@ class ModelScene:
         place[2] -= min(gaps)
 
     def _drawn(self, ghost: bool) -> dict[int, tuple[Any, Any]]:
-        """Return geometry -> its pose and its shape, which a live view sends once but would make for each call."""
+        """Return geometry -> pose and shape; cached, because a live view calls this for each part of a motion."""
         import rerun as rr
 
         model = self._model

@@ -14,12 +14,13 @@ from sim2real.view.sections import SECTIONS, iterations_sections
 
 PAGE = "report.html"
 _MOST_REASONS = 3
-"""Sentences in a verdict's box: why, how far off, what to do next. The others are folded, so that a telephone's first
-screen has the figure."""
+"""Number of sentences in a verdict's box: reason, expected error, next command. Others are collapsed, so that the first
+screen of a telephone has the figure.
+"""
 
 
 def report(run_dir: Path, out: Path | None = None) -> Path:
-    """Write the report of a run: a section for each stage that is finished.
+    """Write the report of a run, with a section for each finished stage.
 
     Args:
         out: The page to write; None: ``report.html`` in the run's folder.
@@ -28,7 +29,7 @@ def report(run_dir: Path, out: Path | None = None) -> Path:
         Path of the page.
 
     Raises:
-        Sim2RealError: When no stage is finished, or a file of the stage is missing or malformed.
+        Sim2RealError: No stage is finished, or a file of a stage is missing or malformed.
     """
     run_dir = Path(run_dir)
     artifacts = finished_stages(run_dir)
@@ -71,10 +72,10 @@ def write_page(
     absent: Mapping[str, str] | None = None,
     notes: Sequence[NoteBlock] = (),
 ) -> Path:
-    """Render sections as a page and write it at once, so that no browser reads a half of it.
+    """Render sections as a page, and write it atomically, so that no browser reads an incomplete page.
 
     Args:
-        absent: Stage without a section -> what became of it, for the head of a page with several sections.
+        absent: Stage without a section -> its status, for the head of a page with several sections.
     """
     environment = Environment(
         loader=PackageLoader("sim2real.view"),
@@ -102,13 +103,13 @@ def write_page(
 
 
 def _tried(run_dir: Path, stage: str) -> str:
-    """Return what became of a stage that is not finished: its newest attempt's status, or ``not yet``."""
+    """Return the status of an unfinished stage: that of its newest attempt, or ``not yet``."""
     tried = attempts(run_dir, stage)
     return tried[0].manifest.status if tried else "not yet"
 
 
 def _about_others(run_dir: Path, artifacts: dict[str, StageFolder]) -> list[NoteBlock]:
-    """Return notes on newer unfinished attempts, which an older one replaces, and on stale stages."""
+    """Return notes on stages that are stale, or whose newest attempt did not finish."""
     notes = []
     # Mention newer attempts that have no section.
     for stage in STAGES:

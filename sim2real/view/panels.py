@@ -17,14 +17,14 @@ from sim2real.view.style import GRID, MUTED, ROLES, SHADE, new_figure, new_grid,
 
 @dataclass(frozen=True)
 class Line:
-    """One line of a panel; ``role``, a name in ``style.ROLES``, determines its appearance."""
+    """One line of a panel, with the appearance of its ``role``, a name in ``style.ROLES``."""
 
     t_s: np.ndarray
     values: np.ndarray
     label: str
     role: str
     held: bool = False
-    """Whether each value holds until the next one, like a command; drawn as steps."""
+    """Whether each value holds until the next one, as for a command; drawn as steps."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ def over_time(panels: Sequence[Panel], name: str, label: str, shade: str = "held
     Args:
         label: Description of the figure, for screen readers.
     """
-    # Panels share a time axis unless they have titles or zooms of their own.
+    # Panels share a time axis unless they have titles or zooms.
     zooms = {panel.zoom for panel in panels}
     beside = [panel.difference for panel in panels if panel.difference is not None]
     closer = zooms != {None} or bool(beside)
@@ -72,7 +72,7 @@ def over_time(panels: Sequence[Panel], name: str, label: str, shade: str = "held
             sharey="none" if beside else "row",
             width_ratios=[2.1, 1][: 1 + closer],
         )
-        # Draw each panel, and its enlarged part beside it.
+        # Draw each panel, with its enlarged part on the right.
         for panel, row in zip(panels, grid, strict=True):
             for axes in row[: 1 if beside else 2]:
                 _fill(axes, panel)
@@ -102,10 +102,10 @@ def over_time(panels: Sequence[Panel], name: str, label: str, shade: str = "held
 
 
 def compared(lines: Sequence[Line], difference: Line, label: str, span: tuple[float, float], name: str) -> str:
-    """Draw lines over time, and below them a difference, in a figure that fits on a telephone. Returns SVG.
+    """Draw lines over time, and below them a difference, in a figure for a telephone. Returns SVG.
 
     Args:
-        label: Label of the upper vertical axis; the lower one has that of the difference.
+        label: Label of the upper vertical axis; the difference labels the lower one.
         span: Shaded interval [s].
     """
     with styled():
@@ -139,7 +139,7 @@ def with_gaps(t_s: np.ndarray, values: np.ndarray, piece: np.ndarray) -> tuple[n
     Args:
         t_s: Times ``(N,)`` [s].
         values: Values ``(N,)``.
-        piece: Number of the piece that each belongs to, ``(N,)``.
+        piece: Number of the piece to which each value belongs, ``(N,)``.
     """
     cuts = np.flatnonzero(np.diff(piece)) + 1
     return np.insert(t_s.astype(float), cuts, np.nan), np.insert(values.astype(float), cuts, np.nan)

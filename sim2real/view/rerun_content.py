@@ -16,7 +16,7 @@ from sim2real.view.signals import Series, Signals, signals_of, simulated_beside
 
 LATENESS = "Lateness [ms]"
 _MOST_PLOTS = 28
-"""More plots beside each other cannot be read: a quadruped's log has 91."""
+"""Largest number of plots: more cannot be read, and a quadruped's log has 91."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Curve:
     Attributes:
         entity: Path of the curve in the recording.
         label: Name in the legend.
-        look: Style, which is the same in every plot: measured, identified, truth, command; empty: Rerun's.
+        look: Style: ``measured``, ``identified``, ``truth``, ``command``; empty: Rerun's default.
         t_s: Times ``(N,)`` [s].
         values: Values ``(N,)``.
     """
@@ -56,7 +56,7 @@ class Tab:
         entity: Prefix of all its entities.
         plots: Title -> curves, from top to bottom.
         motions: Motions in the 3-D view.
-        recent_s: Part before the time cursor that the plots of a live view show [s]; None: the tab is not live.
+        recent_s: Time before the cursor that the plots of a live view show [s]; None: the tab is not live.
     """
 
     title: str
@@ -90,7 +90,7 @@ def _dry(title: str, log: Signals) -> str:
 
 
 def episode_tab(title: str, entity: str, log: Signals, simulated: list[Series]) -> Tab:
-    """Return the tab of a log: measured, true and simulated states, what nodes command, and their lateness."""
+    """Return the tab of a log: measured, true and simulated states, commands of nodes, and lateness."""
     plots: dict[str, list[Curve]] = {}
     models = {s.name: s for s in simulated}
     for series in log.measured:
@@ -107,7 +107,7 @@ def episode_tab(title: str, entity: str, log: Signals, simulated: list[Series]) 
         if index < len(commands):
             curves.append(_curve(f"{entity}/simulation", models[commands[index]], "identified", "simulation"))
         plots.setdefault(_titled(series.name, log.units), []).extend(curves)
-    # Put the motors' commands last, so that they win over fields of the same name from other nodes.
+    # Put the motors' commands last, so that they replace fields of the same name of other nodes.
     motions = [_motion(f"{entity}/scene/robot", log.measured, [*log.commanded, *last], ghost=False)]
     if simulated:
         states = [s for s in simulated if s.name not in commands]
@@ -123,7 +123,7 @@ def episode_tab(title: str, entity: str, log: Signals, simulated: list[Series]) 
 
 
 def with_goals(plots: Mapping[str, list[Curve]]) -> dict[str, list[Curve]]:
-    """Return the plots with each joint's goal, in legs ``q``, beside its position."""
+    """Return the plots with each joint's goal (``q`` for legs) in the plot of its position."""
     merged = dict(plots)
     for title in plots:
         position = re.sub(r"^(goal|q)(?=\[| |$)", "position", title)
@@ -133,7 +133,7 @@ def with_goals(plots: Mapping[str, list[Curve]]) -> dict[str, list[Curve]]:
 
 
 def readable(plots: Mapping[str, list[Curve]]) -> dict[str, list[Curve]]:
-    """Return the plots to show: of more than fit, each goal is beside its position, and constant ones are omitted."""
+    """Return the plots to show; if they are too many, goals join positions, and constant plots are omitted."""
     if len(plots) <= _MOST_PLOTS:
         return dict(plots)
     moving = {t: c for t, c in with_goals(plots).items() if any(len(x.values) and np.ptp(x.values) for x in c)}

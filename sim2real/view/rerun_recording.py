@@ -25,14 +25,14 @@ that do not move are logged as static below ``entity``, moving parts by columns 
 model's prediction, drawn so that it can overlap the robot.
 """
 
-# Readable on the viewer's dark background and on its light one; measured, identified, ... as on the page.
+# Colours that are readable on the viewer's dark and light backgrounds, as on the page.
 _COLORS = {
     "measured": (150, 162, 176), "identified": (66, 150, 230), "truth": (36, 176, 118),
     "command": (190, 112, 192),
 }  # fmt: skip
 _WIDTHS = {"measured": 2.0, "identified": 1.6, "truth": 1.2, "command": 1.6}
 _ROWS = 7
-"""Largest number of plots below each other."""
+"""Largest number of plots in a column."""
 
 
 def view(
@@ -46,15 +46,14 @@ def view(
         serve: Called with the address of the page, which is served until it returns; None: a window.
 
     Raises:
-        Sim2RealError: When Rerun is not installed, no recording or deployment is finished, or what a stage wrote is
-            malformed.
+        Sim2RealError: Rerun is not installed, no recording or deployment is finished, or a stage's file is malformed.
     """
     rr = rerun_module()
-    tabs = tabs_of(finished_stages(run_dir))  # before a viewer opens
+    tabs = tabs_of(finished_stages(run_dir))  # raises an error before a viewer opens
     if not tabs:
         raise Sim2RealError(f"{run_dir} has no recording and no deployment to show", hint="its page has the rest")
     name = f"{pipeline_of(run_dir)} {Path(run_dir).resolve().name}"
-    # Use one application for each run, as the viewer stores one arrangement per application.
+    # Use one application for each run: the viewer stores one arrangement per application.
     recording = rr.RecordingStream(f"sim2real {name}")
     line = open_viewer(recording, str(save) if save else "web" if serve else "window")
     build(recording, tabs, name, scene)
@@ -106,7 +105,7 @@ def send_values(recording: Any, curve: Curve, time: Any) -> None:
 
 
 def blueprint_of(tabs: Sequence[Tab], with_scene: bool) -> Any:
-    """Return the arrangement of the tabs; of live ones the newest is open."""
+    """Return the arrangement of the tabs; of live tabs, the newest is open."""
     import rerun.blueprint as rrb
 
     # The time cursor stays at the newest data of a live view, which opens its newest tab.
@@ -140,7 +139,7 @@ def _page(tab: Tab, with_scene: bool) -> Any:
         rrb.TimeSeriesView(name=title, contents=[c.entity for c in curves], plot_legend=legend, axis_x=whole)
         for title, curves in readable(tab.plots).items()
     ]
-    # Many plots, such as those of several joints, stand in columns.
+    # Arrange many plots, such as those of several joints, in columns.
     columns = -(-len(plots) // _ROWS)
     left = (
         rrb.Grid(*plots, grid_columns=columns, name=tab.title) if columns > 1 else rrb.Vertical(*plots, name=tab.title)

@@ -14,7 +14,7 @@ from sim2real.errors import Sim2RealError
 from sim2real.installation import with_extra
 
 _GRPC_PORT, _WEB_PORT = 9876, 9090
-"""Rerun's own ports; a port that is in use is replaced by a free one."""
+"""Rerun's default ports; a port that is in use is replaced by a free one."""
 LOCAL = "127.0.0.1"
 _START_S = 20.0
 """Longest wait for the server of a page [s]."""
@@ -24,7 +24,7 @@ server = subprocess.Popen([sys.executable, "-m", "rerun_cli", *sys.argv[1:]], st
 sys.stdin.read()
 os.killpg(0, signal.SIGTERM)
 """
-"""Serves until its standard input closes, which the end of this process does, whatever ends it."""
+"""Serves until its standard input closes, at the latest when this process ends for any reason."""
 _keepers: list[subprocess.Popen[bytes]] = []
 """Processes whose input stays open as long as this process lives."""
 
@@ -43,7 +43,7 @@ def open_viewer(recording: Any, target: str) -> str:
         if target == "window":
             if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
                 raise Sim2RealError("this computer has no screen", hint="--view web opens a page for a browser")
-            # The viewer of this installation, whose folder of scripts may lack in PATH.
+            # The viewer of this installation, whose folder of scripts may be missing in PATH.
             os.environ["PATH"] = os.pathsep.join([sysconfig.get_path("scripts"), os.environ.get("PATH", os.defpath)])
             recording.spawn()
             return "the Rerun viewer shows the robot"
@@ -64,7 +64,7 @@ def open_viewer(recording: Any, target: str) -> str:
     except (OSError, RuntimeError, ValueError) as error:
         reason = f"cannot write {target}" if target.endswith(".rrd") else "cannot open the Rerun viewer"
         raise Sim2RealError(
-            f"{reason}: {error}", hint="FILE.rrd in the place of the viewer writes a file, which the viewer opens later"
+            f"{reason}: {error}", hint="give FILE.rrd instead to write a file, which the viewer opens later"
         ) from error
 
 
@@ -80,7 +80,7 @@ def rerun_module() -> Any:
 def _served(interface: str) -> tuple[int, int]:
     """Start Rerun's server of a page, until this process ends; return the ports of the page and of its data.
 
-    Rerun's functions listen at all interfaces, its command has a flag.
+    Rerun's functions listen at all interfaces; its command has a flag for one.
     """
     data_port, port = (_free_port(wanted, interface) for wanted in (_GRPC_PORT, _WEB_PORT))
     ports = ["--port", str(data_port), "--web-viewer-port", str(port), "--server-memory-limit", "256MB"]

@@ -45,7 +45,7 @@ _MAX_LATE = 0.01
 _MOST_PANELS = 40
 """Largest number of panels of a figure: each takes 0.2 s to draw."""
 _SAME = 1e-6
-"""Range of values that are all the same in single precision."""
+"""Values are equal if their range is below this: single precision."""
 _DRY = Banner(
     "doubt",
     "Dry run: the robot did not move",
@@ -121,7 +121,7 @@ def train_section(artifact: StageFolder) -> PageSection:
     last, seeds = curves.success[-1], curves.returns.shape[1]
     best = curves.best_seed
     whose = f"seed {best}, the best of {seeds}" if best is not None else f"median of {seeds} seeds"
-    # Show the success of the policy in the bundle, that of the best evaluation.
+    # Show the success of the bundle's policy, which had the best evaluation.
     success = float(np.nanmedian(last) if best is None else np.nanmax(curves.success[:, best]))
     tiles = [
         Tile("success in simulation", f"{success:.0%}", whose if seeds > 1 else "one seed"),
@@ -230,7 +230,7 @@ def deploy_section(artifact: StageFolder) -> PageSection:
     deployed = Deployment.load(artifact.folder)
     logs = [signals_of(recording) for recording in deployed.recordings]
     blocks: list[Block] = [NoteBlock(text) for log in logs for text in log.warnings]
-    # Draw each episode beside its simulation.
+    # Draw each episode with its simulation.
     units = logs[0].units
     joints = {row.field: row.joint for row in deployed.replay}
     episodes = [
@@ -244,10 +244,10 @@ def deploy_section(artifact: StageFolder) -> PageSection:
             caption += " Speeds of the joints, and commands that do not change, are in the log."
         blocks.append(FigureBlock(deployment_svg(shown, units, index, f"deploy-{index}"), caption))
     blocks += _deploy_tables(deployed)
-    # Fold the timing of all episodes but the first.
+    # Collapse the timing of all episodes except the first.
     for index, log in enumerate(logs):
         blocks += timing_blocks(log.episode, f"deploy-{index}", f" Episode {index}.", folded=index > 0)
-    # The tiles have the success on the robot and in simulation.
+    # The tiles show the success on the robot and in simulation.
     success, tiles = deployed.score("success"), []
     if success.real is not None:
         note = "" if success.simulation is None else f"in simulation {success.simulation:.0%}"
@@ -255,7 +255,7 @@ def deploy_section(artifact: StageFolder) -> PageSection:
     tiles += [Tile("episodes", str(len(deployed.episodes))), *timing_tiles([log.episode for log in logs])]
     lead = f"The policy on {_beside(deployed)}."
     figure = largest_difference(episodes, [row.field for row in deployed.replay], units, "deploy-worst")
-    # Tables come after all figures and sentences.
+    # Put tables after all figures and sentences.
     blocks = sorted(blocks, key=lambda block: isinstance(block, TableBlock | FoldBlock))
     return PageSection("deploy", "Deploy", lead, tiles, [*blocks, *about(artifact)], _deploy_banner(deployed), figure)
 
@@ -294,7 +294,7 @@ def largest_difference(
 ) -> FigureBlock | None:
     """Draw the measurement with the largest difference to its simulation; None without a simulation.
 
-    It is the largest root mean square over a second, as a share of the motion on the robot.
+    Differences are compared by their largest root mean square over a second, as a share of the motion on the robot.
 
     Args:
         positions: Names of the measurements to choose from; empty: all.
@@ -328,7 +328,7 @@ def _lines(pair: ComparedSeries) -> list[Line]:
 
 
 def _shown(pairs: Sequence[ComparedSeries]) -> list[ComparedSeries]:
-    """Return the series of the figure: of a robot with many joints all but speeds and commands that do not change."""
+    """Return the series of the figure; for many joints, without speeds and constant commands."""
     if len(pairs) <= _MOST_PANELS:
         return list(pairs)
     names = {pair.robot.name for pair in pairs}

@@ -65,10 +65,10 @@ class ComparedSeries:
     """One quantity on the robot and in simulation.
 
     Attributes:
-        label: Name of the quantity; of a command with its node.
-        simulation: None without a simulation.
+        label: Name of the quantity; for a command, with its node.
+        simulation: The series in simulation; None without a simulation.
         held: Whether each value holds until the next one, like a command.
-        angle: Whether it is an angle, whose differences are on a circle.
+        angle: Whether it is an angle: then differences are taken modulo a turn.
     """
 
     label: str
@@ -114,7 +114,7 @@ def outputs_of(episode: Episode) -> Signals:
     """Return the time series of all nodes of an episode, without true states."""
     graph = episode.metadata.get("graph", {})
     measured, commanded = [], []
-    # Nodes with inputs command, nodes without inputs measure.
+    # Nodes with inputs send commands, nodes without inputs measure.
     for node, steps in episode.steps.items():
         inputs = graph.get(node, {}).get("inputs", {}) or [k for k in episode.messages if k[0] == node]
         outputs = episode.outputs.get(node, {})
@@ -132,9 +132,9 @@ def simulated_series(columns: Mapping[str, np.ndarray]) -> list[Series]:
     for name, values in columns.items():
         if name == "t" or name.startswith("t_"):
             continue
-        t_s = columns.get(f"t_{name.partition('[')[0]}", columns["t"])  # a vector's entries share their times
+        t_s = columns.get(f"t_{name.partition('[')[0]}", columns["t"])  # the entries of a vector have common times
         if len(t_s) != len(values):
-            # Spread commands without times evenly, as their rate differs from that of the measurements.
+            # Commands without times are spread evenly: their rate differs from the measurements'.
             t_s = np.arange(len(values)) * (float(columns["t"][-1]) / len(values))
         series += components(name, "simulation", t_s, values)
     return series
@@ -164,7 +164,7 @@ def pairs_of(log: Signals, simulation: Sequence[Series], joints: Mapping[str, st
 
     Args:
         simulation: Result of ``simulated_beside``; empty without a simulation.
-        joints: Column of a position -> name of its joint, for labels; other columns have their own name.
+        joints: Column of a position -> name of its joint, for labels; other columns are labelled by their names.
     """
     by_name = {s.name: s for s in simulation}
     commands = [s for s in simulation if s.name.partition("[")[0] == "command"]

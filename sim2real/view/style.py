@@ -1,4 +1,4 @@
-"""The common style of all figures, and their conversion to SVG that uses the page's colours."""
+"""The common style of all figures, and their conversion to SVG with the page's colours."""
 
 import html
 import io
@@ -28,7 +28,7 @@ PHONE_IN = 5.5
 """Width of a figure that a telephone shows without scrolling, with letters of at least 7 pixels [in]."""
 
 _RC: dict[str, Any] = {
-    "svg.fonttype": "none",  # as text, not as outlines: can be searched, read aloud and copied
+    "svg.fonttype": "none",  # text, not outlines: can be searched, read aloud and copied
     "svg.hashsalt": "sim2real",
     "text.parse_math": False,  # names may contain a $
     "font.family": "sans-serif",
@@ -77,7 +77,7 @@ Dash: TypeAlias = str | tuple[int, tuple[float, ...]]
 
 @dataclass(frozen=True)
 class Role:
-    """The appearance of a kind of line, the same in every figure."""
+    """The appearance of a kind of line, common to all figures."""
 
     color: str
     dash: Dash

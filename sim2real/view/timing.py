@@ -29,7 +29,7 @@ _CHAIN = (SENSOR, AGENT, ACTUATOR)
 
 
 def timing_tiles(episodes: Sequence[Episode]) -> Iterator[Tile]:
-    """Yield the worst lateness, the oldest input and the overruns of some episodes; nothing of an imported log."""
+    """Yield the worst lateness, the oldest input and the overruns of some episodes; nothing for imported logs."""
     if any(map(is_imported, episodes)):
         return
     nodes = [(name, node) for e in episodes for name, node in Timing.of(e).nodes.items()]
@@ -44,17 +44,17 @@ def timing_tiles(episodes: Sequence[Episode]) -> Iterator[Tile]:
         yield Tile("oldest input of a step", f"{1e3 * oldest_s:.1f} ms", f"of {name}")
     if overruns := [node.overruns for _, node in nodes if node.overruns is not None]:
         end: Mapping[str, Json] = episodes[-1].metadata.get("log", {}).get("session_end") or {}
-        lost = end.get("lost_replies")  # the count covers all episodes of a session
+        lost = end.get("lost_replies")  # each log has the count of the whole session
         yield Tile("overruns", str(sum(overruns)), f"{lost} lost replies" if lost is not None else "")
 
 
 def is_virtual(episode: Episode) -> bool:
-    """Return whether an episode is one of an embedded robot, on whose clock no thread is late."""
+    """Return whether an episode ran in the virtual time of an embedded robot, in which no thread is late."""
     return episode.metadata.get("port") == "embedded"
 
 
 def timing_blocks(episode: Episode, name: str, which: str = "", folded: bool = False) -> list[Block]:
-    """Return schedule and table of an episode's timing; nothing of an imported log, whose steps have stamps alone."""
+    """Return schedule and table of an episode's timing; nothing for an imported log, which has only stamps."""
     if is_imported(episode):
         return []
     caption = f"Timing of each node [ms]{which and ',' + which.lower().rstrip('.')}"
@@ -68,7 +68,7 @@ def timing_blocks(episode: Episode, name: str, which: str = "", folded: bool = F
 
 
 def schedule(episode: Episode, name: str) -> str:
-    """Draw when nodes computed and waited: in real time around the latest wake-up, in virtual time in the middle."""
+    """Draw when nodes computed and waited, around the latest wake-up, or in virtual time in the episode's middle."""
     nodes = [n for n in in_order(episode) if len(episode.steps[n])]
     periods = [float(np.median(np.diff(s.start))) for s in episode.steps.values() if len(s) > 1]
     length = _PERIODS_SHOWN * max(periods, default=1e6 * episode.duration_s)
@@ -101,7 +101,7 @@ def schedule(episode: Episode, name: str) -> str:
 
 def _bars(axes: Axes, steps: Steps, row: int, begin: float, end: float) -> None:
     """Draw the steps of one node that overlap an interval [us]."""
-    # Draw the waiting from the previous step's end on, as after an overrun a step is due before it.
+    # Draw waiting from the previous step's end: after an overrun, a step is due before that end.
     free = np.concatenate([[0], steps.end[:-1]])
     due_at = np.minimum(np.maximum(steps.scheduled + steps.drift, free), steps.start)
     near = (steps.end >= begin) & (due_at <= end)
@@ -109,7 +109,7 @@ def _bars(axes: Axes, steps: Steps, row: int, begin: float, end: float) -> None:
     kinds: tuple[tuple[np.ndarray, np.ndarray, dict[str, Any]], ...] = (
         (due, start, {"facecolor": "none", "edgecolor": MUTED, "hatch": "////", "lw": 0.6}),
         (start, woken, {"facecolor": ORANGE}),
-        (woken, done, {"facecolor": BLUE, "edgecolor": BLUE, "lw": 0.8}),  # edge: keeps short steps visible
+        (woken, done, {"facecolor": BLUE, "edgecolor": BLUE, "lw": 0.8}),  # an edge keeps short steps visible
     )
     for first, last, look in kinds:
         wide = last > first
@@ -133,10 +133,10 @@ def _messages(axes: Axes, episode: Episode, nodes: list[str], begin: float, end:
 
 
 def delay_blocks(recording: Recording, identification: Identification | None) -> list[Block]:
-    """Return the table of the delay's parts; nothing of an imported log, whose steps have stamps alone.
+    """Return the table of the delay's parts; nothing for an imported log, which has only stamps.
 
     Args:
-        identification: Of this robot, with the device's share; None: the share is unknown.
+        identification: Identification of this robot, which has the device's share; None: the share is unknown.
     """
     episode = recording.episode
     if is_imported(episode) or not set(_CHAIN) <= set(episode.steps):
@@ -147,7 +147,7 @@ def delay_blocks(recording: Recording, identification: Identification | None) ->
         sum_s += (spread.p50 or 0.0) if counted else 0.0
         cells = [MISSING if s is None else fixed(1e3 * s, 2) for s in astuple(spread)]
         rows.append([name, where if counted else f"({where})", *cells])
-    # No clock of this computer measures the rest: from a motion to its sample, and from a command to the motion.
+    # This computer cannot measure the rest: from a motion to its sample, and from a command to the motion.
     rows_of = identification.parameters if identification else ()
     whole = "sum of the medians, without the device and parts in ()"
     if (device := next((p for p in rows_of if p.name == ROUND_TRIP), None)) is not None:
@@ -159,9 +159,9 @@ def delay_blocks(recording: Recording, identification: Identification | None) ->
 
 
 def parts_of(recording: Recording) -> Iterator[tuple[str, str, np.ndarray, bool]]:
-    """Yield the parts that clocks of this computer measure: name, ``host`` or ``bus``, times ``(N,)`` [s].
+    """Yield the measured parts: name, ``host`` or ``bus``, times ``(N,)`` [s], and whether the part counts in the sum.
 
-    The fourth is whether a part counts in the sum: the sensor's request on the bus comes before the sample.
+    The sensor's request on the bus does not count, because it comes before the sample.
     """
     timing, steps = recording.timing, recording.episode.steps[SENSOR]
     yield f"{SENSOR}, from the sample to its message", "host", (steps.end - steps.begun) / TICKS_PER_S, True

@@ -57,7 +57,7 @@ def test_a_grid_is_named_in_its_order():
         (["gamma=0.9,0.9"], "is no list of different numbers"),
         (["gamma=0.9", "gamma=0.8"], "is no list of different numbers for one setting"),
         (["gamma=0.9,1.9"], r"gamma must lie in \[0, 1\], got 1.9"),
-        (["target_kl=0.1,0.2"], "target_kl does nothing with a linear step size"),
+        (["target_kl=0.1,0.2"], "target_kl has no effect with a linear step size"),
     ],
 )
 def test_what_cannot_be_swept_is_refused(texts, message):

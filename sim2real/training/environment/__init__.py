@@ -1,1 +1,1 @@
-"""Environments for PPO: episodes on a compiled graph, with drawn robots, timelines and pushes."""
+"""Environments for PPO: episodes on a compiled graph, with random robots, timelines and pushes."""

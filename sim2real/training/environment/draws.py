@@ -25,8 +25,8 @@ def draw_robots(
 
     Args:
         values: Parameter -> the value to train on.
-        identification: None: the values are those of a data sheet.
-        randomise: Factor on the deviations; 0: draw only the parameters in ``vary.range``.
+        identification: None: the values come from a data sheet.
+        randomise: Factor on the standard deviations; 0: draw only the parameters in ``vary.range``.
     """
     draws: dict[str, np.ndarray] = {}
     if vary.uniform and randomise:
@@ -50,20 +50,20 @@ def draw_robots(
 def without_default_ranges(
     vary: VariationConfig, defaults: VariationConfig, identified: Mapping[str, float]
 ) -> VariationConfig:
-    """Return a variation without the ranges of a pipeline for parameters that were identified; a user's stay.
+    """Return a variation without the pipeline's ranges of identified parameters; the user's ranges stay.
 
     Args:
         defaults: The pipeline's variation.
-        identified: Parameter -> estimate, or the value at which it was held.
+        identified: Parameter -> estimate, or the value at which it was fixed.
     """
     ranges = {n: r for n, r in vary.range.items() if n not in identified or defaults.range.get(n) != r}
     return replace(vary, range=ranges)
 
 
 def widen_posterior(identification: Identification, posterior: Posterior, factor: float) -> Posterior:
-    """Return the identification's posterior with deviations times a factor.
+    """Return the identification's posterior with its standard deviations times a factor.
 
-    The variance between logs is added after that.
+    Then the variance between logs is added.
     """
     covariance = posterior.covariance * factor**2
     names = list(posterior.names)

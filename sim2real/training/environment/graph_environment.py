@@ -25,7 +25,7 @@ class EnvState(NamedTuple):
         graph: The graph's state, run up to the supervisor's step of this row.
         terms: Sum of each named reward term so far.
         good: Number of rows in the second half of the episode in which the task was fulfilled.
-        width: Share of the differences between episodes that this one has; None: all.
+        width: Share of the differences between episodes for this episode; None: 1.
     """
 
     graph: GraphState
@@ -45,8 +45,8 @@ class GraphEnvironment(TrainingEnvironment):
 
     Args:
         steps: Shape ``(E,)``: policy steps of each timeline; None: all of them.
-        curriculum: Share of the differences between episodes at the first and at the last update; None: always all.
-            ``reset`` takes the last.
+        curriculum: Share of the differences between episodes at the first and at the last update; None: always 1.
+            ``reset`` uses the last.
         follow: Success of episodes above which the share grows; 0: it grows with the updates.
 
     Raises:
@@ -74,16 +74,16 @@ class GraphEnvironment(TrainingEnvironment):
         of_task = task.privileged
         self.privileged = None if of_task is None else lambda state: of_task(state.graph)
 
-        # One row less than the tables have, as the observation after an episode's last row is looked up in them too.
-        # So no row is past their end, and no state has to be masked.
+        # One row less than in the tables, where the observation after an episode's last row is also looked up. So no
+        # # row is past their end, and no state has to be masked.
         self.length = graph.rows - 1
 
-        # The row of an episode's last step is not played: its observation is the final one.
+        # The row of an episode's last step is not played, but gives the final observation.
         counts = graph.timeline.vertices[graph.supervisor].count if steps is None else steps
         self._last = jax.device_put(graph.last_row(np.asarray(counts)).astype(np.int32))
         self._data: PyTree = None
 
-        # jit, so that each is traced only once for all its uses: tracing MuJoCo's worlds takes 5 s.
+        # jit, so that each function is traced once for all its uses: tracing MuJoCo's worlds takes 5 s.
         self._start, self._play = jax.jit(self._reset), jax.jit(self._step)
         self._rewarding = [name for name, node in graph.nodes.items() if getattr(node, "has_reward", False)]
         # The world of a composed task may end an episode: its `ends` returns whether it is terminated, and truncated.
@@ -164,14 +164,14 @@ class GraphEnvironment(TrainingEnvironment):
 
 
 def _require_reward(task: TrainingTask, graph_state: GraphState, action: jax.Array, world: str) -> None:
-    """Refuse a training task whose reward does not depend on that of the composed task in a world."""
+    """Refuse a training task whose reward does not depend on the reward of the composed task in its world."""
     state = graph_state.state[world]
 
     def rewarded(earned: tuple[jax.Array, dict[str, jax.Array]]) -> Rewards:
         known = {**graph_state.state, world: state.replace(reward=earned[0], terms=earned[1])}
         return task.reward(graph_state.replace(state=known), action)
 
-    # An input that no operation reads, and that is no output, has no effect.
+    # An input has no effect if no operation reads it and it is no output.
     program = jax.make_jaxpr(rewarded)((state.reward, state.terms)).jaxpr
     read = {id(v) for equation in program.eqns for v in equation.invars} | {id(v) for v in program.outvars}
     if not any(id(v) in read for v in program.invars):

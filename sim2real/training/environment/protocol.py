@@ -1,16 +1,15 @@
-"""The environments that PPO trains on: pure functions of one copy.
+"""The protocol of PPO's environments: pure functions of one copy.
 
-One call of ``step`` is called a row. The policy makes a step only in rows marked ``valid``; in the others its action is
-ignored, and the observation is already that of the next policy step::
+One call of ``step`` is called a row. The policy makes a step only in rows marked ``valid``; in other rows its action is
+ignored, and the observation is already the input of the next policy step::
 
-    row          0        1        2        3
-    valid        yes      no       yes      yes
-    observation  o0  ->   o1  ->   o1  ->   o3       o1: the policy's input in row 2
-    reward       r0       r1       r2       r3       r1 is added to r0, without a discount
-    terminated   no       no       no       yes      row 3's observation is the final one; reset before the next row
+    row          0        1        2        3 valid        yes      no       yes      yes observation  o0  ->   o1  ->
+    o1  ->   o3       o1: the policy's input in row 2 reward       r0       r1       r2       r3       r1 is added to
+    r0, without a discount terminated   no       no       no       yes      row 3's observation is the final one; reset
+    before the next row
 
-An episode ends in a row with ``terminated`` (the value after it is 0) or ``truncated`` (the value after it is that of
-the observation returned in that row). If both are set, the row counts as terminated.
+An episode ends in a row with ``terminated`` (the value after it is 0) or ``truncated`` (the value after it is estimated
+from the observation that the row returned). If both are set, the row counts as terminated.
 """
 
 from collections.abc import Callable
@@ -56,9 +55,9 @@ class TrainingEnvironment:
         observation_size: Number of entries O of an observation.
         action_low: Shape ``(A,)``: lower bounds of the action [the action's units].
         action_high: Shape ``(A,)``: upper bounds of the action [the action's units].
-        curriculum: Share of the differences between episodes at the first and at the last update; None: always all.
-        follow: Success above which the share grows, by the metric ``success``; 0: it grows with the updates.
-        privileged: Returns quantities of a state that the policy does not observe ``(P,)``; None: there are none.
+        curriculum: Share of the differences between episodes at the first and at the last update; None: always 1.
+        follow: Metric ``success`` above which the share grows; 0: it grows with the updates.
+        privileged: Returns quantities of a state that the policy does not observe ``(P,)``; None: none.
     """
 
     observation_size: int
@@ -97,7 +96,7 @@ def get_privileged(env: TrainingEnvironment, config: PPOConfig) -> Callable[[PyT
 
 
 QUICKEST = 0.25
-"""Share of the updates in which a curriculum that follows success reaches its last share if success is always high."""
+"""A curriculum that follows success reaches its last share within this share of the updates at the earliest."""
 
 
 def get_width(
@@ -106,7 +105,8 @@ def get_width(
     """Return the share of the differences, shape ``()``, after ``update`` updates; None without a curriculum.
 
     Args:
-        reached: The share that success has reached, for training; ``update >= config.updates`` is an evaluation.
+        reached: The present share of a curriculum that follows success; not used if ``update >= config.updates``, as in
+            an evaluation.
     """
     if env.curriculum is None:
         return None
@@ -119,7 +119,7 @@ def get_width(
 def widen(
     env: TrainingEnvironment, config: PPOConfig, reached: jax.Array, success: jax.Array, ended: jax.Array
 ) -> jax.Array:
-    """Return the share of the differences after a rollout: it grows if the episodes that ended were successful.
+    """Return the share of the differences after a rollout, which grows if the finished episodes were successful.
 
     Args:
         success: Shape ``(T, N)``: the metric of each row.
@@ -153,7 +153,7 @@ def check_environment(env: TrainingEnvironment) -> None:
     step = jax.eval_shape(env.step, start, jax.ShapeDtypeStruct(low.shape, np.float32), key)
     for name, leaf in (("reset's", observation), ("step's", step.observation)):
         if leaf.shape != (size,):
-            raise UsageError(f"{name} observation has shape {leaf.shape}, observation_size promises ({size},)")
+            raise UsageError(f"{name} observation has shape {leaf.shape}, but observation_size is {size}")
 
     # Numbers and flags of a step, then the state.
     scalars = {"reward": step.reward, **{f"metrics[{name!r}]": leaf for name, leaf in step.metrics.items()}}
@@ -198,7 +198,7 @@ def _check_state(start: object, after: object) -> None:
         raise UsageError(
             f"reset and step return states of different structure: {jax.tree.structure(start)} and "
             f"{jax.tree.structure(after)}",
-            hint="a row may change the values in a state, not its parts",
+            hint="a row may change the values in a state, but not its structure",
         )
     for (path, a), b in zip(jax.tree_util.tree_leaves_with_path(start), jax.tree.leaves(after), strict=True):
         if (a.shape, a.dtype) != (b.shape, b.dtype):

@@ -19,11 +19,11 @@ class Pushes:
     """Pushes of each joint, independent of the others, at the times of policy steps.
 
     Attributes:
-        world: Its ``velocity(state)`` returns the joints' velocities ``()`` or ``(joints,)`` [rad/s, or m/s], and its
-            ``with_velocity(state, velocity)`` the state with others. With ``floats`` they are those of a floating base:
+        world: World with ``velocity(state)``, the joints' velocities ``()`` or ``(joints,)`` [rad/s, or m/s], and
+            ``with_velocity(state, velocity)``. A world with a floating base (``floats``) has the base's velocities:
             linear ``(3,)`` [m/s], then angular ``(3,)`` [rad/s].
-        sizes: Largest change of each velocity, or of all with one number [rad/s, or m/s]; changes are uniform within
-            it, in both directions. Six: of a floating base, linear ones first.
+        sizes: Largest change of each velocity, or one number for all [rad/s, or m/s]; changes are uniform in both
+            directions. For a floating base six numbers, linear ones first.
         chance: Probability that a joint is pushed in a row.
     """
 

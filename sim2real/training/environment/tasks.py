@@ -18,7 +18,7 @@ from sim2real.types import PyTree
 
 if TYPE_CHECKING:
     Rewards: TypeAlias = jax.Array | Mapping[str, jax.Array]
-    """The reward of a row, shape ``()``, or its terms by name, whose sum it is."""
+    """The reward of a row, shape ``()``, or its terms by name, which are added up."""
 else:
     Rewards = PyTree
 
@@ -30,8 +30,8 @@ class TrainingTask(ABC):
         supervisor: Name of the node whose steps the policy makes.
         action_low: Shape ``(A,)``: lower bounds of the action [the command's unit].
         action_high: Shape ``(A,)``: upper bounds of the action [the command's unit].
-        has_curriculum: Whether ``params`` takes a share of the differences between episodes.
-        privileged: Returns true quantities of a graph's state ``(P,)``, for a value function; None: there are none.
+        has_curriculum: Whether ``params`` uses its argument ``width``.
+        privileged: Returns true quantities of a graph's state ``(P,)``, for a value function; None: none.
     """
 
     supervisor: str
@@ -43,7 +43,7 @@ class TrainingTask(ABC):
 
     @abstractmethod
     def params(self, key: jax.Array, width: jax.Array | None = None) -> dict[str, PyTree]:
-        """Draw the parameters of the graph's nodes for an episode with a share of the differences; None: all."""
+        """Draw the parameters of the graph's nodes for an episode; ``width``: share of the differences; None: 1."""
 
     @abstractmethod
     def observe(self, step_state: StepState) -> jax.Array:

@@ -19,23 +19,23 @@ from sim2real.runtime.compiled.placement import Placement, Placer
 STRETCH_S = 1.0
 """Length of a stretch of a recording [s]: hiccups of a computer last tens of milliseconds."""
 _MAX_PAUSES = (np.inf, 3.0, 2.0, 1.5, 1.25)
-"""Limits on the pause between two policy steps, tried in this order, in periods."""
+"""Longest allowed pauses between two policy steps, tried in this order [periods]."""
 _LONG_STEP = 0.25
-"""Steps longer than this share of the policy's period are replaced after an episode's end."""
+"""After the end of an episode, steps longer than this share of the policy's period are replaced."""
 _MIN_SHARE = 0.5
-"""Timelines whose first pause lies in this share of the episode, from its start, are redrawn."""
+"""Timelines whose first pause lies within this share of the episode are drawn again."""
 _MAX_ROUNDS = 20
 
 
 @dataclass
 class Stretches:
-    """Starts of the stretches in the recording: the same for all nodes and connections.
+    """Random stretches of the recording, common to all nodes and connections.
 
-    A hiccup of the computer hits all nodes at once, so times that were measured together are drawn together.
+    A hiccup of the computer delays all nodes at once, so times that were measured together are drawn together.
 
     Attributes:
         pauses: Whether the long steps of the recording are used.
-        calm_s: Shape ``(E,)``: time from which on an episode has no long steps [s]; None: never.
+        calm_s: Shape ``(E,)``: time after which an episode has no long steps [s]; None: never.
     """
 
     seed: int
@@ -44,7 +44,7 @@ class Stretches:
 
     def begins(self, episodes: int, count: int) -> np.ndarray:
         """Return the starts as a share of the recording, shape ``(episodes, count)``."""
-        # Drawn stretch by stretch: a larger count keeps the first stretches.
+        # Draw stretch by stretch, so that a larger count keeps the first stretches.
         return np.random.default_rng(self.seed).random((count, episodes)).T
 
 
@@ -54,7 +54,7 @@ class RecordedTimes(DelayDistribution):
     Args:
         samples: Shape ``(N,)``: the time of each step or message [s], in their order.
         rate_hz: Number of samples in a second [Hz].
-        long_s: Longer times are replaced by the median from ``calm_s`` on [s].
+        long_s: Longer times are replaced by the median after ``calm_s`` [s].
     """
 
     def __init__(self, samples: np.ndarray, rate_hz: float, stretches: Stretches, long_s: float) -> None:
@@ -64,7 +64,7 @@ class RecordedTimes(DelayDistribution):
         return f"RecordedTimes({self.samples.size} samples, {self.rate_hz:g} Hz)"
 
     def sample(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-        """Return times [s] for E episodes, shape ``(E, N)``; the stretches hold the random numbers."""
+        """Return times [s] for E episodes, shape ``(E, N)``; ``stretches`` has drawn the random numbers."""
         del rng
         episodes, length = shape
         size = min(max(1, round(STRETCH_S * self.rate_hz)), self.samples.size)
@@ -100,8 +100,7 @@ class RecordedTiming:
 
         Args:
             rate_hz: The policy's rate [Hz].
-            pauses: Whether the robot's pauses are kept; otherwise steps longer than a quarter of the period are
-                dropped.
+            pauses: Whether to keep the robot's pauses; otherwise steps longer than a quarter of the period are dropped.
 
         Raises:
             Sim2RealError: Most steps of a node took too long for a policy of this rate.
@@ -119,7 +118,7 @@ class RecordedTiming:
         return RecordedTiming(stretches, computation, transport)  # type: ignore[arg-type]  # split leaves two parts
 
     def set_transport(self, nodes: Mapping[str, BaseNode]) -> None:
-        """Give the connections the recorded transport times; phases stay those of the nodes on the robot."""
+        """Give the connections the recorded transport times; the nodes' phases stay as on the robot."""
         for (reader, name), dist in self.transport.items():
             if reader in nodes and name in nodes[reader].inputs:
                 nodes[reader].inputs[name].delay_dist = dist
@@ -132,7 +131,7 @@ class TimelineDraw:
     Attributes:
         steps: Shape ``(E,)``: number of policy steps after which each episode ends.
         cut: Number of episodes that end early, before a pause that does not fit into the program's rows.
-        redrawn: Number of timelines drawn again, because their first such pause lay in the first half.
+        redrawn: Number of timelines that were drawn again, because such a pause was in their first half.
         longest_pause_s: Longest time between two policy steps in any of them [s].
     """
 
@@ -153,9 +152,8 @@ def draw_timelines(
 ) -> TimelineDraw:
     """Draw timelines.
 
-    A row of the program holds one policy step and a fixed number of world ticks. After a pause of several periods a
-    robot catches up: it makes several steps in quick succession, which do not fit into rows. Such an episode ends
-    before the pause.
+    A row of the program has one policy step and a fixed number of world ticks. After a pause of several periods a robot
+    makes several steps in quick succession, which do not fit into rows. So such an episode ends before the pause.
 
     Args:
         recorded: The robot's times; None: draw from the nodes' own delay distributions.
@@ -164,14 +162,14 @@ def draw_timelines(
         timeline = draw(nodes, episode_s, count, np.random.default_rng(seed))
         return _with_figures(timeline, supervisor, timeline.vertices[supervisor].count, 0, 0)
 
-    # Draw timelines without long steps: they set the cost of a row.
+    # Draw timelines without long steps, which determine the cost of a row.
     recorded.stretches.calm_s = np.zeros(count)
     calm = draw(nodes, episode_s, count, seed)
     if not recorded.stretches.pauses:
         return _with_figures(calm, supervisor, calm.vertices[supervisor].count, 0, 0)
     calm_cost = _row_cost(nodes, supervisor, calm)
 
-    # Allow the longest pauses whose rows cost no more.
+    # Allow the longest pauses that do not make a row more expensive.
     for periods in _MAX_PAUSES:
         drawn = _draw_with_pauses(nodes, supervisor, episode_s, count, seed, recorded, periods)
         if drawn is None or bursty_episodes(nodes, drawn.timeline).any():
@@ -179,7 +177,7 @@ def draw_timelines(
         if _row_cost(nodes, supervisor, drawn.timeline) <= calm_cost:
             return drawn
     raise Sim2RealError(
-        "nearly every timeline drawn from this log holds a pause of the policy",
+        "nearly every timeline drawn from this log has a pause of the policy",
         hint="record on a less busy machine, or train shorter episodes with --episode-s",
     )
 
@@ -201,7 +199,7 @@ def _draw_with_pauses(
     for attempt in range(_MAX_ROUNDS):
         recorded.stretches.seed, recorded.stretches.calm_s = seed + 1000 * attempt, None
         timeline, last = _end_at_pauses(nodes, supervisor, episode_s, count, recorded.stretches, periods)
-        # Accept those that are long enough, up to the number that is missing.
+        # Accept timelines that are long enough, up to the missing number.
         long = last >= _MIN_SHARE * timeline.vertices[supervisor].count
         long &= np.cumsum(long) <= missing
         if long.any():

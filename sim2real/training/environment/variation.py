@@ -10,35 +10,40 @@ class VariationConfig:
     """Differences between the episodes of a training."""
 
     misfit: bool = True
-    """Widen the identification's posterior until the predictions of its draws spread as far as the model's misfit."""
+    """Widen the identification's posterior until the predictions of its samples spread as far as the model's misfit."""
     pauses: bool = True
     """Keep the pauses of the robot's computer; otherwise steps longer than a quarter of the period are dropped."""
     noise: float = 1.0
-    """Factor on the noise, the rounding and the bias of the sensor as estimated from the log; 0: exact readings."""
+    """Factor on the sensor's noise, rounding and bias as estimated from the log; 0: exact readings."""
     uniform: float = 0.0
-    """Draw dynamics and delays uniformly instead, within this share of their value up and down: 0.3 is 30 %; 0: draw
-    from the posterior."""
+    """Draw dynamics and delays uniformly, within this share of their values in both directions: 0.3 is 30 %; 0: draw
+    from the posterior.
+    """
     range: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Draw a parameter uniformly from this range instead, for instance a payload: NAME LOW HIGH, one flag a
-    parameter. The pipeline's own ranges of other parameters stay."""
+    """Draw a parameter uniformly from this range, for instance a payload: NAME LOW HIGH; repeat the flag for each
+    parameter. The pipeline's ranges of other parameters stay.
+    """
     push: float = 0.0
-    """Largest change of a joint's velocity by a push from outside [rad/s], or of a floating base's linear velocity
-    [m/s], uniform within it; 0: no pushes."""
+    """Largest change of a joint's velocity by a push [rad/s], or of a floating base's linear velocity [m/s]; changes
+    are uniform; 0: no pushes.
+    """
     push_angular: float | None = None
     """Largest change of a floating base's angular velocity by a push [rad/s]; default: the number of --vary.push."""
     push_hz: float = 0.5
-    """Pushes of each joint in a second, at random times [Hz]."""
+    """Pushes of each joint per second, at random times [Hz]."""
     start_position: float = 0.0
     """Largest offset of an episode's start from the robot's usual start, drawn for each joint [rad]."""
     start_velocity: float = 0.0
     """Largest offset of a joint's velocity at an episode's start, drawn for each joint [rad/s]."""
     curriculum: tuple[float, float] = (1.0, 1.0)
-    """Share of all these differences (parameters, delays, noise, pushes, starts), and of the velocities that a walking
-    robot is commanded, at the first and at the last update; in between it grows linearly, or as --vary.follow sets.
-    Evaluations have the last. 0 1 begins with the model alone."""
+    """Share of all these differences (parameters, delays, noise, pushes, starts), and of a walking robot's commanded
+    velocities, at the first and at the last update; it grows linearly, or as --vary.follow sets. Evaluations use the
+    last. 0 1 begins without differences.
+    """
     follow: float = 0.0
-    """Success of the training's episodes above which the share of a curriculum grows, 0 to 1: from the first to the
-    last share in a quarter of the updates at the earliest; below it the share stays. 0: it grows linearly."""
+    """Success in training, 0 to 1, above which the share of a curriculum grows, from the first to the last share in a
+    quarter of the updates at the earliest; below it, the share stays. 0: it grows linearly.
+    """
 
     @property
     def grows(self) -> bool:

@@ -21,7 +21,7 @@ Layers = tuple[tuple[Array, Array], ...]
 
 @runtime_checkable
 class Network(Protocol):
-    """A network with a fixed number of outputs; stateless ones carry an empty tuple from step to step."""
+    """A network with a fixed number of outputs; the carry of a stateless network is an empty tuple."""
 
     def init(self, rng: np.random.Generator, inputs: int, gain: float) -> PyTree:
         """Return parameters, a pytree of float32 arrays.
@@ -45,9 +45,9 @@ Factory = Callable[[int], Network | linen.Module]
 
 
 def orthogonal(rng: np.random.Generator, n_in: int, n_out: int, gain: float) -> np.ndarray:
-    """Draw an orthogonal kernel, shape ``(n_in, n_out)``; in numpy, as compiling a QR that runs once takes longer."""
+    """Draw an orthogonal kernel, shape ``(n_in, n_out)``; in numpy, because compiling a QR takes longer."""
     q, r = np.linalg.qr(rng.normal(size=(max(n_in, n_out), min(n_in, n_out))))
-    q = q * np.sign(np.diagonal(r))  # QR's choice of signs would make the distribution non-uniform
+    q = q * np.sign(np.diagonal(r))  # without this, QR's choice of signs would make the distribution non-uniform
     return (gain * (q if n_in >= n_out else q.T)).astype(np.float32)
 
 
@@ -72,7 +72,7 @@ def apply_mlp(layers: Layers, x: jax.Array) -> jax.Array:
 
 @dataclass(frozen=True)
 class MLP:
-    """Tanh layers and a linear last one.
+    """Tanh layers and a linear last layer.
 
     Attributes:
         widths: Widths of the hidden layers and of the output.
@@ -95,7 +95,7 @@ class MLP:
 
 @dataclass(frozen=True)
 class GRU:
-    """A gated recurrent unit (Cho et al. 2014) in place of a perceptron's first layer.
+    """A perceptron whose first layer is a gated recurrent unit (Cho et al. 2014).
 
     With reset gate r, update gate z and candidate n, columns of the kernels in this order::
 
@@ -108,7 +108,7 @@ class GRU:
     widths: tuple[int, ...]
 
     def init(self, rng: np.random.Generator, inputs: int, gain: float) -> dict[str, PyTree]:
-        """Return orthogonal kernels; the update gate's bias is 1, so that the unit has memory from the start."""
+        """Return orthogonal kernels; the update gate's bias is 1, so that the unit remembers from the start."""
         width = self.widths[0]
         bias = np.repeat(np.array([0.0, 1.0, 0.0], np.float32), width)
         kernels = [np.concatenate([orthogonal(rng, n, width, 1.0) for _ in range(3)], 1) for n in (inputs, width)]
@@ -134,7 +134,7 @@ class FlaxNetwork:
     """A module of flax.linen, called as ``module(x)``, or ``module(carry, x)`` if it has ``initialize_carry``.
 
     Attributes:
-        module: The module; it may have no variables besides its parameters.
+        module: The module, which must have no variables except its parameters.
         inputs: Number of entries of its input.
     """
 
@@ -153,8 +153,7 @@ class FlaxNetwork:
         if set(variables) != {"params"}:
             raise UsageError(
                 f"{type(self.module).__name__} has variables besides its parameters: {', '.join(sorted(variables))}",
-                hint="use layers without a state of their own, LayerNorm in place of BatchNorm; observations are "
-                "normalised already",
+                hint="use layers without a state, LayerNorm instead of BatchNorm; observations are normalised already",
             )
         return jax.tree.map(np.asarray, variables["params"])
 
@@ -196,8 +195,8 @@ def make_network(
 
     Args:
         kind: ``"mlp"``, ``"gru"``, ``"package.module:Class"``, or a factory.
-        exported: Whether a robot will run the network, as it runs an actor. A network that cannot be exported is then
-            refused before it is trained.
+        exported: Whether a robot will run the network: then a network that cannot be exported is refused before the
+            training.
 
     Raises:
         UsageError: There is no such network, the factory makes no network, or it cannot be exported.
@@ -233,14 +232,14 @@ def find_factory(name: str) -> Factory:
     """Return the class with a name such as ``package.module:Class``.
 
     Raises:
-        UsageError: It cannot be imported, or is no class: such a name may come from another person's bundle, which
-            must not be able to call a library's functions.
+        UsageError: It cannot be imported, or is no class: the name may come from another person's bundle, which must
+            not call functions of a library.
     """
     module, sign, attribute = name.partition(":")
     hint = "write mlp, gru, or package.module:Class; found as Python finds modules, and in the current directory"
     if not (sign and module and attribute):
         raise UsageError(f"there is no network {name!r}", hint=hint)
-    # The path of an installed command lacks the current directory.
+    # An installed command does not have the current directory in its path.
     here = str(Path.cwd())
     sys.path.append(here)
     try:
@@ -255,7 +254,7 @@ def find_factory(name: str) -> Factory:
 
 
 def name_of(kind: str | Factory) -> str:
-    """Return a network's name, ``package.module:Class`` of one that is not ours."""
+    """Return a network's name; for a user's network, ``package.module:Class``."""
     if isinstance(kind, str):
         return kind
     return f"{kind.__module__}:{getattr(kind, '__qualname__', type(kind).__qualname__)}"

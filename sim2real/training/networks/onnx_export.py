@@ -1,6 +1,6 @@
-"""Export of a policy with a user's network to ONNX: a robot runs it without JAX and without the network's code.
+"""Exports a policy with a user's network to ONNX, so that a robot runs it without JAX and the network's code.
 
-The networks of this package write their own graph: ``sim2real.policy.onnx_graph``.
+``sim2real.policy.onnx_graph`` exports the networks of this package.
 """
 
 import importlib.util
@@ -22,14 +22,15 @@ from sim2real.training.networks.policy import Policy
 from sim2real.types import PyTree
 
 PARITY = 1e-4
-"""Largest accepted difference between ONNX and JAX, as a fraction of the actions' range. A layer's norm amplifies
-the last bits of inputs that hardly differ: 1.1e-5 behind a GroupNorm of clipped values."""
+"""Largest accepted difference between ONNX and JAX, as a share of the actions' range. A normalisation amplifies
+rounding errors of nearly equal inputs: 1.1e-5 after a GroupNorm of clipped values.
+"""
 
 
 def export_graph(policy: Policy) -> bytes | None:
-    """Return the policy as a serialised ONNX model; None for networks that a bundle runs without one.
+    """Return the policy as a serialised ONNX model; None for networks that need none.
 
-    If onnxruntime is installed, the model is compared with JAX on observations as in one episode.
+    If onnxruntime is installed, the model is compared with JAX on observations of an episode.
 
     Raises:
         UsageError: jax2onnx is not installed, or does not translate the network.
@@ -37,7 +38,7 @@ def export_graph(policy: Policy) -> bytes | None:
     """
     if policy.spec.built_in:
         return None
-    # One step of a batch of 1; the leaves of the carry are inputs and outputs of the model.
+    # Export one step of a batch of 1; the leaves of the carry are inputs and outputs of the model.
     first, tree = jax.tree.flatten(policy.initial_carry())
 
     def step(observation: jax.Array, *carry: jax.Array) -> list[jax.Array]:
@@ -69,14 +70,14 @@ def translate(step: Callable[..., PyTree], shapes: Sequence[tuple[int, ...]], ne
     """Return the ONNX model of a step of a batch of 1, from observation and carry to an action and the next carry.
 
     Args:
-        shapes: Of the inputs without the batch axis: the observation, then each leaf of the carry.
+        shapes: Shapes of the inputs without the batch axis: the observation, then each leaf of the carry.
         network: The network's name, for errors.
 
     Raises:
         UsageError: jax2onnx is not installed, or does not translate the network.
     """
     try:
-        from jax2onnx import to_onnx  # importing it takes seconds
+        from jax2onnx import to_onnx  # imported late: it takes seconds
     except ImportError as error:
         raise UsageError(
             f"network {network} is exported to ONNX by jax2onnx, which is not installed", hint=with_extra("network")
@@ -84,10 +85,10 @@ def translate(step: Callable[..., PyTree], shapes: Sequence[tuple[int, ...]], ne
     inputs = [jax.ShapeDtypeStruct((1, *shape), jnp.float32) for shape in shapes]
     carry = [f"carry_{i}" for i in range(len(shapes) - 1)]
     names, after = ["observation", *carry], ["action", *(f"next_{name}" for name in carry)]
-    traced = jaxpr_as_fun(jax.make_jaxpr(step)(*inputs))  # it does not trace a module of flax under `vmap`
+    traced = jaxpr_as_fun(jax.make_jaxpr(step)(*inputs))  # jax2onnx does not trace a module of flax under `vmap`
     try:
         return to_onnx(traced, inputs, model_name="policy", opset=OPSET, input_names=names, output_names=after)
-    except Exception as error:  # its errors share no base class
+    except Exception as error:  # errors of jax2onnx have no common base class
         raise UsageError(
             f"network {network} is not exported to ONNX, so no robot could run it: {error}",
             hint="use layers that jax2onnx translates",

@@ -25,10 +25,10 @@ from sim2real.types import Array, PyTree
 def log_prob(u: jax.Array, mean: jax.Array, log_std: jax.Array, squash: bool = False) -> jax.Array:
     """Return the log density, shape ``()``, of ``u (A,)`` under a normal distribution with a diagonal covariance.
 
-    Without distrax: importing it takes 1.7 s, a fifth of a training of the pendulum.
+    Written without distrax, whose import takes 1.7 s, a fifth of a training of the pendulum.
 
     Args:
-        squash: Return the density of ``tanh(u)``: that of ``u`` divided by the slope of tanh.
+        squash: Whether to return the density of ``tanh(u)``.
     """
     z = (u - mean) * jnp.exp(-log_std)
     density = -jnp.sum(0.5 * z**2 + log_std + 0.5 * math.log(2.0 * math.pi))
@@ -36,7 +36,7 @@ def log_prob(u: jax.Array, mean: jax.Array, log_std: jax.Array, squash: bool = F
 
 
 def log_slope(u: jax.Array) -> jax.Array:
-    """Return the logarithm of the volume by which tanh stretches at ``u``, shape ``(A,)``; exact for large ``u``."""
+    """Return log |d tanh(u) / du|, shape ``(A,)``; accurate for large ``u``."""
     return jnp.sum(2.0 * (math.log(2.0) - u - jax.nn.softplus(-2.0 * u)))
 
 
@@ -47,13 +47,13 @@ def entropy(log_std: jax.Array) -> jax.Array:
 
 @pytree.dataclass
 class Policy(Base):
-    """A Gaussian policy: the observation is normalised, the network gives the mean, which is bounded and scaled.
+    """A Gaussian policy: normalises the observation, computes the mean by the network, bounds and scales it.
 
-    By default the mean is clipped to [-1, 1], not squashed by tanh: tasks such as a swing-up need full actions, which
-    tanh reaches only for very large means, and train more slowly with it.
+    By default the mean is clipped to [-1, 1]. Tasks such as a swing-up need full actions, which tanh reaches only for
+    very large means, so that they train more slowly with it.
 
     Attributes:
-        params: The network's parameters; of a perceptron one pair ``(kernel (n_in, n_out), bias (n_out,))`` per layer.
+        params: The network's parameters; for a perceptron, a pair ``(kernel (n_in, n_out), bias (n_out,))`` per layer.
         log_std: Shape ``(A,)``: logarithm of the exploration noise, in units of half the action range.
         mean: Shape ``(O,)``: the observation's mean.
         std: Shape ``(O,)``: the observation's standard deviation.
@@ -95,7 +95,7 @@ class Policy(Base):
         """Return the next carry, and the action without exploration noise, shape ``(A,)``.
 
         Args:
-            carry: From ``initial_carry`` at the episode's start, then from the step before.
+            carry: Result of ``initial_carry`` at the episode's start, then of the previous step.
             observation: Shape ``(O,)``, in the units of the training.
         """
         carry, u = self.get_mean(carry, observation)
@@ -112,7 +112,7 @@ class Policy(Base):
         """
         if is_recurrent(self.network):
             raise UsageError(
-                f"a policy of network {self.spec.name!r} remembers: its action does not follow from an observation",
+                f"a policy of network {self.spec.name!r} has memory: its action depends on earlier observations",
                 hint="call step(carry, observation), beginning each episode with initial_carry()",
             )
         _, u = self.get_mean(self.initial_carry(), observation)
@@ -124,7 +124,7 @@ class Policy(Base):
         """Return the arrays of a policy bundle: ``layers.<i>.kernel``, ``layers.<i>.bias``, ``log_std``, ...
 
         Raises:
-            Sim2RealError: This is a batch of policies: its leaves have a leading seed axis.
+            Sim2RealError: This is a batch of policies, whose leaves have a leading seed axis.
         """
         if np.ndim(self.log_std) != 1:
             raise Sim2RealError(
@@ -165,7 +165,7 @@ def _to_arrays(name: str, params: PyTree) -> dict[str, Array]:
 
 def _from_arrays(kind: str | Factory, arrays: Mapping[str, jax.Array]) -> tuple[Network, PyTree]:
     """Return a network and its parameters; the inverse of ``_to_arrays``."""
-    # Networks of this package: their widths are those of the arrays.
+    # For networks of this package, take the widths from the arrays.
     if kind in BUILT_IN:
         layers = tuple(layers_of(arrays))
         widths = tuple(bias.shape[0] for _, bias in layers)
@@ -173,7 +173,7 @@ def _from_arrays(kind: str | Factory, arrays: Mapping[str, jax.Array]) -> tuple[
             return MLP(widths), layers
         gru = gru_of(arrays)
         return GRU((gru["recurrent"].shape[0], *widths)), {**gru, "layers": layers}
-    # A user's network: make it again, and compare its parameters with the arrays.
+    # Make a user's network again, and compare its parameters with the arrays.
     require(arrays, BESIDES)
     inputs, outputs = arrays["mean"].size, arrays["log_std"].size
     network = make_network(kind, (), inputs, outputs, exported=False)

@@ -1,7 +1,7 @@
-"""The state of a training right after an evaluation, and its safetensors file, to continue from.
+"""The state of a training after an evaluation, and its safetensors file, from which a training can continue.
 
-The file is replaced as a whole: a process that is interrupted while it writes leaves the earlier file. Orbax takes
-0.5 s to import, and 45 ms for a save that takes 6 ms here.
+The file is replaced as a whole: a process that is interrupted while it writes leaves the earlier file. Orbax takes 0.5
+s to import, and 45 ms for a save that takes 6 ms here.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from sim2real.types import Array, Json, PyTree
 
 _METADATA = "training"
 _MAY_DIFFER = ("target", "minutes")
-"""Settings that change when training ends, but not its numbers."""
+"""Settings that change when training ends, but not its results before."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Progress:
         env_steps: Number of rows so far, per seed.
         elapsed_s: Time that training took so far, compilation included [s].
         values: Name -> shape ``(num_seeds,)``: ``return``, the environment's metrics, losses.
-        best: The best policy so far, see ``TrainResult``; None in checkpoints, which hold it once.
+        best: The best policy so far, see ``TrainResult``; None in checkpoints, which store it once.
     """
 
     evaluation: int
@@ -71,8 +71,7 @@ class TrainingIdentity:
     """The properties in which a resumed training must equal the interrupted one.
 
     Attributes:
-        program: Digest of the program and the environment's data: they hold the timing, and depend on the versions of
-            code and compiler.
+        program: Hash of the program and the environment's data, which depend on timing, code and compiler.
     """
 
     config: Mapping[str, Json]
@@ -89,7 +88,7 @@ class TrainingIdentity:
         digest = hashlib.sha256(lowered.as_text().encode())
         for leaf in jax.tree.leaves(data):
             digest.update(np.asarray(leaf).tobytes())
-        plain = json.loads(json.dumps(settings))  # as a file has them: lists for tuples
+        plain = json.loads(json.dumps(settings))  # as in a file: lists for tuples
         return TrainingIdentity(plain, np.asarray(jax.random.key_data(key)).tolist(), digest.hexdigest())
 
     def entries(self) -> dict[str, Json]:
@@ -129,7 +128,7 @@ def save_checkpoint(path: Path, identity: TrainingIdentity, training: Checkpoint
     metadata = dataclasses.asdict(identity) | times
     metadata["sha256"] = _digest(arrays, metadata)
 
-    # Write beside the file, then replace it at once.
+    # Write a temporary file, then replace the checkpoint atomically.
     draft = path.with_name(f".{path.name}.tmp")
     contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     save_file(contiguous, draft, {_METADATA: json.dumps(metadata)})
@@ -140,7 +139,7 @@ def load_checkpoint(path: Path, identity: TrainingIdentity, state: TrainState, p
     """Return the training in a file.
 
     Args:
-        identity: The training that the file must hold.
+        identity: The training that the file must contain.
         state: A state of the same training, for its structure and the types of its keys.
 
     Raises:

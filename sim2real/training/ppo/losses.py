@@ -1,4 +1,4 @@
-"""The networks over the rows of a rollout, the advantages of the rows, and the loss that an update minimises."""
+"""Applies networks to the rows of a rollout, and computes advantages and the loss."""
 
 from functools import partial
 from typing import NamedTuple
@@ -51,7 +51,7 @@ def unroll(
     end: jax.Array,
     following: jax.Array | None = None,
 ) -> Unrolled:
-    """Apply a network to rows, with an initial carry after an episode's end.
+    """Apply a network to rows; after an episode's end it restarts with the initial carry.
 
     Args:
         carry: The carry before the first row; leaves of shape ``(N, ...)``.
@@ -83,7 +83,7 @@ def unroll(
 
 
 class Batch(NamedTuple):
-    """T rows of each of N copies, as the loss takes them.
+    """T rows of each of N copies: the input of the loss.
 
     Attributes:
         x: Shape ``(N, T, O)``: normalised observations.
@@ -93,7 +93,7 @@ class Batch(NamedTuple):
         value: Shape ``(N, T)``: value estimates before the update.
         advantage: Shape ``(N, T)``.
         weight: Shape ``(N, T)``: 1 in rows with a policy step, else 0.
-        noise: Shape ``(N, T, A)``: ``u`` in deviations from its mean; None if actions are not squashed.
+        noise: Shape ``(N, T, A)``: ``u`` minus its mean, in standard deviations; None if actions are not squashed.
         end: Shape ``(N, T)``, bool: rows that end an episode.
         actor_carry: The actor's carry before the first row; leaves of shape ``(N, ...)``.
         critic_carry: The value function's carry before the first row.
@@ -126,10 +126,11 @@ def gae(rows: Rows, value: jax.Array, following: jax.Array, gamma: float, gae_la
     def back(
         carry: tuple[jax.Array, jax.Array, jax.Array], x: tuple[Rows, jax.Array, jax.Array]
     ) -> tuple[tuple[jax.Array, jax.Array, jax.Array], jax.Array]:
-        later_advantage, later_value, later_reward = carry  # of the next policy step, and of the rows before it
+        # Advantage of the next policy step; reward of the rows before it.
+        later_advantage, later_value, later_reward = carry
         row, value, following = x
 
-        # At an episode's end the sum stops. After a truncation the value of the final observation is added.
+        # At an episode's end the sum stops; after a truncation it includes the value of the final observation.
         end = row.terminated | row.truncated
         later_value = jnp.where(end, jnp.where(row.terminated, 0.0, following), later_value)
         later_advantage = jnp.where(end, 0.0, later_advantage)
@@ -144,7 +145,7 @@ def gae(rows: Rows, value: jax.Array, following: jax.Array, gamma: float, gae_la
         )
         return carry, advantage
 
-    # Backwards in time, as each row needs the next.
+    # Go backwards in time, because each row needs the next one.
     zeros = jnp.zeros_like(value[0])
     return jax.lax.scan(back, (zeros, following[-1], zeros), (rows, value, following), reverse=True)[1]
 
@@ -157,7 +158,7 @@ def loss(
     Returns:
         The loss, and its parts by name; each of shape ``()``.
     """
-    # Apply both networks; from here on all rows of all copies lie on one axis.
+    # Apply both networks; from here on, all rows of all copies are on one axis.
     critic = batch.x if batch.critic is None else batch.critic
     mean = _outputs(networks.actor, params["actor"], batch.actor_carry, batch.x, batch)
     value = _outputs(networks.critic, params["value"], batch.critic_carry, critic, batch)[:, 0]
@@ -169,14 +170,14 @@ def loss(
     log_ratio = jax.vmap(lambda u, m: log_prob(u, m, params["log_std"], squashed))(batch.u, mean) - batch.log_prob
     ratio = jnp.exp(log_ratio)
 
-    # Entropy; tanh lowers it, on average over the policy's own samples.
+    # Entropy; tanh lowers it, by an average over the policy's samples.
     bonus = entropy(params["log_std"])
     if batch.noise is not None:
         drawn = mean + jnp.exp(params["log_std"]) * batch.noise
         bonus = bonus + jnp.sum(weight * jax.vmap(log_slope)(drawn))
     parts = {"entropy": bonus, "kl": jnp.sum(weight * (ratio - 1.0 - log_ratio))}
 
-    # Clipped surrogate of the policy, with advantages of mean 0 and deviation 1.
+    # Clipped surrogate of the policy, with advantages of mean 0 and standard deviation 1.
     centred = batch.advantage - jnp.sum(weight * batch.advantage)
     advantage = centred / jnp.sqrt(jnp.sum(weight * centred**2) + 1e-8)
     clipped = jnp.clip(ratio, 1.0 - config.clip, 1.0 + config.clip)
@@ -198,8 +199,8 @@ def loss(
 def _outputs(network: Network, params: PyTree, carry: PyTree, x: jax.Array, batch: Batch) -> jax.Array:
     """Return a network's outputs for ``x (N, T, inputs)``, shape ``(N T, outputs)``."""
     if not is_recurrent(network):
-        # Each part of the rows has a copy of the parameters, whose gradients are added up: a GPU computes them side by
-        # side. Products over all 12,288 rows of a Go2's minibatch take an H200 24 ms of an update's 42 ms.
+        # Give each part of the rows a copy of the parameters, and add up the gradients: a GPU computes the parts in
+        # # parallel. Products over all 12,288 rows of a Go2's minibatch take an H200 24 ms of an update's 42 ms.
         rows = _flat(x)
         parts = _parts(rows.shape[0])
         copies = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (parts, *jnp.shape(leaf))), params)
@@ -210,7 +211,7 @@ def _outputs(network: Network, params: PyTree, carry: PyTree, x: jax.Array, batc
 
 
 def _parts(rows: int) -> int:
-    """Return the number of equal parts, each of 256 rows or more, whose gradients a GPU computes side by side."""
+    """Return the number of equal parts, of at least 256 rows each, whose gradients a GPU computes in parallel."""
     parts = 32 if jax.default_backend() == "gpu" else 1
     while parts > 1 and (rows % parts or rows < 256 * parts):
         parts //= 2

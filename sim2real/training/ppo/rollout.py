@@ -41,9 +41,9 @@ class Rows(NamedTuple):
         truncated: Shape ``(T, N)``.
         valid: Shape ``(T, N)``.
         following: Shape ``(T, N, O)``: the observation after the row, before any reset.
-        metrics: Name -> shape ``(T, N)``: the environment's, after the row.
+        metrics: Name -> shape ``(T, N)``: the environment's metrics after the row.
         privileged: Shape ``(T, N, P)``: the value function's further inputs; None if it has none.
-        privileged_following: Shape ``(T, N, P)``: the same after the row.
+        privileged_following: Shape ``(T, N, P)``: these inputs after the row.
     """
 
     observation: jax.Array
@@ -74,7 +74,7 @@ class PolicyEvaluation(NamedTuple):
 
 
 def repeat(carry: T, count: int) -> T:
-    """Return an initial carry for each of N copies, leaves ``(N, ...)``."""
+    """Repeat a carry for each of N copies, leaves ``(N, ...)``."""
     return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *jnp.shape(leaf))), carry)
 
 
@@ -91,8 +91,8 @@ def collect(
     """Play ``rollout_steps`` rows with exploration noise; a copy whose episode ends starts another one.
 
     Args:
-        copies: The copies after the last rollout; if ``update`` is 0 all of them are reset.
-        update: Shape ``()``, int32: number of updates so far; in an evaluation, of rollouts.
+        copies: The copies after the last rollout; if ``update`` is 0, all copies are reset.
+        update: Shape ``()``, int32: number of updates so far; in an evaluation, number of rollouts.
         evaluating: Shape ``()``, bool: play without exploration noise, cut no episode, and draw episodes as at the end
             of the curriculum.
         reached: Shape ``()``: the share of a curriculum that follows success; None without such a curriculum.
@@ -103,7 +103,7 @@ def collect(
     count, rows = config.num_envs, config.rollout_steps
     key_reset, key_noise, key_step = jax.random.split(key, 3)
 
-    # Draw one initial state per copy for the whole rollout, as a reset may cost more than a row.
+    # Draw one initial state per copy for the whole rollout, because a reset may take longer than a row.
     width = get_width(env, config, jnp.where(evaluating, config.updates, update), reached)
     initial = _reset(env, width, key_reset, count)
     fresh = Copies(*initial, repeat(policy.initial_carry(), count), copies.critic_carry)
@@ -113,8 +113,8 @@ def collect(
     noise = jax.random.normal(key_noise, (rows, count, policy.low.shape[0]))
     noise = jnp.where(evaluating, 0.0, jnp.exp(policy.log_std)) * noise
 
-    # Cut the first episodes after different numbers of rows. Otherwise all copies would stay at the same time of their
-    # episodes, and each update would learn from only one phase of the task.
+    # Cut the first episodes after different numbers of rows. Otherwise all copies would be at the same time in their
+    # # episodes, and each update would learn from only one phase of the task.
     cut = jnp.where(evaluating, 0, 1 + jnp.arange(count) * config.eval_steps // count)
     row = partial(_play_row, env, config, policy, fresh, cut)
     numbers = update * rows + jnp.arange(1, rows + 1)
@@ -178,7 +178,7 @@ def new_evaluation(env: TrainingEnvironment, config: PPOConfig) -> PolicyEvaluat
 
 
 def add_rows(evaluation: PolicyEvaluation, rows: Rows, config: PPOConfig) -> PolicyEvaluation:
-    """Return the evaluation after more rows; rows behind a copy's first episode do not count."""
+    """Return the evaluation after more rows; rows after a copy's first episode do not count."""
     end = rows.terminated | rows.truncated
     runs = evaluation.running & (jnp.cumsum(end, axis=0) - end == 0)  # (T, N): before each row
     last = runs & end
@@ -195,9 +195,9 @@ def add_rows(evaluation: PolicyEvaluation, rows: Rows, config: PPOConfig) -> Pol
 
 
 def averages(evaluation: PolicyEvaluation) -> dict[str, jax.Array]:
-    """Return the means over the episodes that ended, each of shape ``()``.
+    """Return the means over the finished episodes, each of shape ``()``.
 
-    ``finished`` is the share of the episodes that ended, ``terminated`` the share of those that a termination ended.
+    ``finished`` is the share of episodes that ended, ``terminated`` the share of these that a termination ended.
     """
     running = evaluation.running
     share = jnp.mean(jnp.where(running, 0.0, 1.0))

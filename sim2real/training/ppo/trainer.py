@@ -53,13 +53,14 @@ from sim2real.types import Array, PyTree
 
 T = TypeVar("T")
 GPU_OPTIONS = {"xla_gpu_autotune_level": 0, "xla_gpu_enable_triton_gemm": False}
-"""No trials of several kernels for each small matrix product of the networks. The pendulum compiles on
-an H200 in 4.9 s instead of 9.0 s; a step takes 1.4 times as long, 0.7 s of 3 M steps."""
+"""Compiler options: do not try several kernels for each small matrix product of the networks. The pendulum compiles on
+an H200 in 4.9 s instead of 9.0 s; a step takes 1.4 times as long, which costs 0.7 s for 3 M steps.
+"""
 FINITE = {
     "finite_observation": ("the observation", "reset or step"),
     "finite_privileged": ("the privileged observation", "privileged"),
 }
-"""Figures that mark which entries were finite: name -> the array, and the environment's method that makes it."""
+"""Figure with the mask of finite entries -> name of the array, and the environment's method that makes it."""
 _Numbers = dict[str, Array]
 """Swept setting -> its value for each member, shape ``(M,)``."""
 _Figures = dict[str, jax.Array]
@@ -73,9 +74,9 @@ class TrainResult:
     Attributes:
         policies: The policies at the end; leaves have a leading seed axis.
         best: The policy with the highest success rate over all seeds and evaluations; of equals, the highest return.
-        best_seed: Its seed; of a sweep, its place on the seed axis.
-        members: Swept settings of each place on the seed axis, empty without a sweep; all seeds of the first settings
-            come first.
+        best_seed: Seed of ``best``; in a sweep, its place on the seed axis.
+        members: Swept settings of each place on the seed axis, with all seeds of the first settings first; empty
+            without a sweep.
         history: Name -> shape ``(evaluations, num_seeds)``: the values of ``Progress``; shorter than
             ``config.evaluations`` if training ended earlier: at the target, or after ``config.minutes``.
         env_steps: Shape ``(evaluations,)``: number of rows per seed at each evaluation, of one policy step at most.
@@ -114,10 +115,10 @@ def train(
 
     Args:
         key: From ``jax.random.key`` or ``PRNGKey``; seed i depends on it and on i alone.
-        on_progress: Called after every evaluation, those before a resumption too; an exception that it raises ends the
-            training. A ``Progress`` of this process has the best policy so far.
-        checkpoint: File that receives the whole training after each evaluation. Of several processes all have to name
-            one, and the first writes it.
+        on_progress: Called after every evaluation, also for those before a resumption; an exception in it ends the
+            training.
+        checkpoint: File to which the whole training is written after each evaluation. Several processes must all name
+            it; the first one writes it.
         resume: A checkpoint to continue from. The result equals that of an uninterrupted training, bit for bit on one
             machine.
         actor: Makes the actor, a module of flax.linen or a ``Network``, with the given number of outputs; default: the
@@ -164,9 +165,9 @@ class _Session(NamedTuple):
 
     Attributes:
         state: The state before the first update, on its devices; the program overwrites its memory.
-        numbers: The settings that are swept.
+        numbers: The swept settings.
         data: The environment's data: a training after another recording finds its program in the cache.
-        layout: Where the arrays lie; None: on one device.
+        layout: Placement of the arrays on devices; None: one device.
     """
 
     config: PPOConfig
@@ -192,7 +193,7 @@ class _Session(NamedTuple):
         networks = make_networks(env, config, *makers)
         state = make_initial_state(env, sweep.configs(config), key, networks)
 
-        # The settings of a sweep share an axis with the seeds: both are independent, and devices divide them alike.
+        # The settings of a sweep share an axis with the seeds: all are independent, and are divided among devices.
         members = with_numbers(config, {"num_seeds": config.num_seeds * len(sweep.grid)})
         layout = shardings_of(state, members)
         state = place(state, layout)
@@ -217,7 +218,8 @@ def _train_until_evaluation(
     Training and evaluation are iterations of one scan: the environment's step, most of the program, is compiled once
     instead of twice: on a CPU the pendulum has 28 % less to compile, the arm 36 %.
     """
-    update_once = jax.jit(partial(update, env, config, networks))  # jit, so that it is traced once for both its uses
+    # Jit, so that the function is traced once for both its uses.
+    update_once = jax.jit(partial(update, env, config, networks))
     count, apart = config.updates_per_evaluation, config.eval_envs is not None and config.eval_envs < config.num_envs
 
     def iteration(
@@ -226,7 +228,7 @@ def _train_until_evaluation(
         state, evaluated_copies, evaluation = now
         evaluating = i >= count
 
-        # Collect rows with the current policy: of the training's copies, or of those that are evaluated.
+        # Collect rows with the current policy, by the training's copies or by the copies of the evaluation.
         key_rollout, _, key_evaluation = keys(state)
         key = choose(evaluating, jax.random.fold_in(key_evaluation, i), key_rollout)
         number = jnp.where(evaluating, i - count, state.update)
@@ -251,7 +253,7 @@ def _train_until_evaluation(
     rollouts = 0 if apart else config.rollouts_per_evaluation
     (state, _, evaluation), stats = jax.lax.scan(iteration, start, jnp.arange(count + rollouts))
 
-    # Average the figures over the updates; an entry counts as finite if it was so in each of them.
+    # Average the figures over the updates; an entry counts as finite if it was finite in each of them.
     stats = jax.tree.map(lambda leaf: leaf[:count], stats)
     finite = {name: stats.pop(name).all(0) for name in FINITE if name in stats}
     values = {name: leaf.mean(0) for name, leaf in stats.items()} | finite
@@ -259,7 +261,7 @@ def _train_until_evaluation(
     values |= {} if width is None else {"width": width}
     policy = make_policy(env, config, networks, state.params, state.normaliser)
     if apart:
-        # Few copies play the evaluation in a loop of their own.
+        # A smaller number of copies plays the evaluation in a separate loop.
         few = with_numbers(config, {"num_envs": cast(int, config.eval_envs)})
         return state, policy, values | evaluate(env, few, policy, keys(state)[2])
     return state, policy, values | averages(evaluation)
@@ -269,7 +271,7 @@ def _advance(program: _Program, session: _Session, training: Checkpoint, offset_
     """Return the training after its next evaluation.
 
     Args:
-        offset_s: Turns the clock into the time that training took so far.
+        offset_s: Added to the clock, it gives the time that training took so far [s].
     """
     config = session.config
     state, policies, values = program(training.state, session.numbers, session.data)
@@ -301,7 +303,7 @@ def _save(path: Path, identity: TrainingIdentity, training: Checkpoint, layout: 
 
 def _result(session: _Session, training: Checkpoint, first: int, compile_s: float, train_s: float) -> TrainResult:
     """Return the result; ``first`` is the number of evaluations that an earlier process made."""
-    # Figures of all evaluations, and the speed of this process alone.
+    # Figures of all evaluations, and the speed of this process.
     log, history = training.log, history_of(training.log)
     members = [point for point in session.sweep.grid for _ in range(session.config.num_seeds)]
     trained = log[-1].env_steps - (log[first - 1].env_steps if first else 0)
@@ -333,10 +335,10 @@ def check_values(values: dict[str, np.ndarray], env_steps: int, config: PPOConfi
     """Raise if a value is not finite or no episode ended.
 
     Args:
-        values: Name -> shape ``(num_seeds,)``; those in ``FINITE`` have a second axis, of the entries.
+        values: Name -> shape ``(num_seeds,)``; values in ``FINITE`` have a second axis, with the entries.
         names: Name of each place on the seed axis, such as ``seed 0``.
     """
-    # Causes come before their consequences: observations, rewards, then losses.
+    # Check causes before their consequences: observations, rewards, then losses.
     for seed, name in enumerate(names):
         when = f"({name}, within {env_steps} rows)"
         for part, (array, method) in FINITE.items():
@@ -361,7 +363,7 @@ def check_values(values: dict[str, np.ndarray], env_steps: int, config: PPOConfi
                 f"no evaluation episode ended within eval_steps={config.eval_steps} rows",
                 hint="raise eval_steps above the longest episode, or let the environment truncate",
             )
-        # Metrics of episodes come last: they may follow from the causes above.
+        # Check metrics of episodes last: the causes above may explain them.
         metrics = sorted(name for name, value in values.items() if not np.isfinite(value[seed]).all())
         if metrics:
             raise Sim2RealError(f"metrics {', '.join(metrics)} of finished episodes are not finite {when}")
@@ -378,7 +380,7 @@ def check_target(env: TrainingEnvironment, config: PPOConfig) -> None:
 
 @contextmanager
 def small_random_numbers() -> Iterator[None]:
-    """Make JAX draw random numbers by one kernel, not by 200 operations at each place; the numbers are the same."""
+    """Make JAX draw random numbers by one kernel instead of 200 operations; the numbers are the same."""
     name = "jax_threefry_gpu_kernel_lowering"
     before = jax.config.values[name]
     jax.config.update(name, True)
@@ -413,10 +415,10 @@ def find_best(history: dict[str, np.ndarray]) -> tuple[int, int]:
 def make_initial_state(
     env: TrainingEnvironment, configs: Sequence[PPOConfig], key: jax.Array, networks: ActorCritic
 ) -> TrainState:
-    """Return the states before the first update, with a leading axis, in numpy: a GPU compiles each small operation.
+    """Return the states before the first update, with a leading axis; in numpy, to compile no small operations.
 
     Args:
-        configs: Settings that differ only in numbers. The leading axis has all seeds of the first, then those of the
+        configs: Settings that differ only in numbers. The leading axis has all seeds of the first settings, then of the
             next.
         key: Seed i depends on it and on i alone.
     """
@@ -493,7 +495,7 @@ def _repeated(carry: T, count: tuple[int, ...]) -> T:
 def _new_learner(
     config: PPOConfig, networks: ActorCritic, rng: np.random.Generator, sizes: tuple[int, int, int | None]
 ) -> tuple[dict[str, PyTree], optax.OptState, Normaliser, Normaliser | None]:
-    """Return networks, optimiser and normalisers; ``sizes``: of observation, action and privileged observation."""
+    """Return networks, optimiser and normalisers; ``sizes`` of observation, action and privileged observation."""
     size, actions, privileged = sizes
     params = {
         "actor": networks.actor.init(rng, size, 0.01),
@@ -514,7 +516,7 @@ def _new_normaliser(size: int) -> Normaliser:
 
 
 def _blank(shapes: T, leading: tuple[int, ...], key: jax.Array) -> T:
-    """Return zeros of given shapes and dtypes, with leading axes, in numpy; keys as ``key`` with data of zeros."""
+    """Return zeros with given shapes and dtypes, and leading axes, in numpy; keys like ``key`` with data of 0."""
 
     def leaf(struct: jax.ShapeDtypeStruct) -> Array:
         if struct.dtype == key.dtype:
@@ -527,5 +529,5 @@ def _blank(shapes: T, leading: tuple[int, ...], key: jax.Array) -> T:
 
 
 def _keys(data: np.ndarray, like: jax.Array) -> jax.Array:
-    """Return keys of their data; moving it to a device compiles nothing."""
+    """Return keys made of their data, without a compilation."""
     return jax.random.wrap_key_data(jax.device_put(data), impl=jax.random.key_impl(like))

@@ -1,4 +1,4 @@
-"""One PPO update: the batch of a rollout with its advantages, minibatch steps of Adam, and the normaliser."""
+"""One PPO update: makes the batch of a rollout with advantages, takes minibatch steps, updates the normaliser."""
 
 from collections.abc import Callable
 from functools import partial
@@ -23,7 +23,7 @@ _MIN_VARIANCE = 1e-6
 """Smallest variance of an observation, in its unit squared."""
 ADAM_EPS = 1e-5
 MIN_RATE, MAX_RATE, RATE_FACTOR = 1e-5, 1e-2, 1.5
-"""Bounds of an adaptive step size, and the factor of a change: those of rsl_rl."""
+"""Bounds of an adaptive step size, and the factor of a change, as in rsl_rl."""
 
 
 # -- running statistics of the networks' inputs
@@ -56,7 +56,7 @@ def update_normaliser(normaliser: Normaliser, observations: jax.Array, valid: ja
     mean = (weight * observations).sum((0, 1), keepdims=True) / count
     var = (weight * (observations - mean) ** 2).sum((0, 1)) / count
 
-    # Those of all observations.
+    # Combine them with all earlier observations.
     total = normaliser.seen + count
     delta = mean[0, 0] - normaliser.mean
     squares = normaliser.var * normaliser.seen + var * count + delta**2 * normaliser.seen * count / total
@@ -69,10 +69,10 @@ def deviations(normaliser: Normaliser) -> jax.Array:
 
 
 def normalise_parameters(normaliser: Normaliser, values: jax.Array) -> jax.Array:
-    """Return physical parameters ``(O,)`` in deviations from their mean.
+    """Return physical parameters ``(O,)`` minus their means, in standard deviations.
 
-    They have any order of magnitude, and some are equal in all episodes. So the smallest deviation is a thousandth of
-    the mean, not a constant.
+    Their orders of magnitude differ, and some are equal in all episodes. So the smallest standard deviation is a
+    thousandth of the mean, and not a constant.
     """
     std = jnp.sqrt(normaliser.var + (1e-3 * normaliser.mean) ** 2 + 1e-20)
     return jnp.clip((values - normaliser.mean) / std, -OBSERVATION_CLIP, OBSERVATION_CLIP)
@@ -84,7 +84,7 @@ def normalise_parameters(normaliser: Normaliser, values: jax.Array) -> jax.Array
 def make_optimiser(config: PPOConfig) -> optax.GradientTransformation:
     """Return Adam with gradient clipping; a linear step size falls to 5 %, an adaptive one is part of the state.
 
-    It acts on one flat vector, which compiles and runs faster than a dozen small arrays.
+    Adam acts on one flat vector, which compiles and runs faster than a dozen small arrays.
     """
     if config.schedule == "adaptive":
         adam = optax.inject_hyperparams(optax.adam, static_args=("eps",))(config.learning_rate, eps=ADAM_EPS)
@@ -110,7 +110,7 @@ def adapt_rate(rate: jax.Array, kl: jax.Array, target_kl: float) -> jax.Array:
 
     Args:
         rate: Shape ``()``.
-        kl: Shape ``()``: KL divergence from the policy that played [nat]; 0, as before the first step, keeps the rate.
+        kl: Shape ``()``: KL divergence from the policy that played [nat]; 0 (before the first step) keeps the rate.
         target_kl: Wanted KL divergence [nat].
     """
     smaller, larger = jnp.maximum(rate / RATE_FACTOR, MIN_RATE), jnp.minimum(rate * RATE_FACTOR, MAX_RATE)
@@ -124,7 +124,8 @@ class TrainState(NamedTuple):
     """The state of one seed's training between two updates.
 
     Attributes:
-        params: ``{"actor": ..., "log_std": (A,), "value": ...}``: the networks' parameters, and the noise.
+        params: ``{"actor": ..., "log_std": (A,), "value": ...}``: the networks' parameters, and the log standard
+            deviation of the noise.
         privileged: Statistics of the value function's further inputs; None if it has none.
         update: Shape ``()``, int32: number of updates so far.
         key: The seed's key; it never changes. ``keys`` derives the keys of an update from it.
@@ -178,7 +179,7 @@ def prepare(
     critic = _critic_input(state, x, rows.privileged)
     critic_following = _critic_input(state, x_following, rows.privileged_following)
 
-    # Compute the means of the actions, and the values, by networks that may have memory.
+    # Compute the means of the actions, and the values; the networks may have memory.
     end, copies, squash = rows.terminated | rows.truncated, state.copies, policy.spec.squash
     mean = unroll(networks.actor, policy.params, copies.carry, x, rows.valid, end).y
     values = unroll(
@@ -251,7 +252,7 @@ def update(
         return (optax.apply_updates(params, change), optimiser_state), parts | {"loss": total}
 
     def epoch(carry: _Learner, shuffle: jax.Array) -> tuple[_Learner, dict[str, jax.Array]]:
-        # Shuffled per epoch, not per minibatch: devices exchange copies only here, then gradients.
+        # Shuffle once per epoch, not per minibatch: devices exchange copies only here, and then gradients.
         index = shuffle.reshape(config.minibatches, -1)
         parts = divide_minibatches(jax.tree.map(lambda leaf: leaf[index], batch), config)
         return jax.lax.scan(minibatch, carry, parts)
@@ -272,7 +273,7 @@ def update(
     if rows.privileged_following is not None:
         stats |= {"finite_privileged": jnp.isfinite(rows.privileged_following).all((0, 1))}
 
-    # The normaliser comes last: the log densities above are those of the policy that played the rows.
+    # Update the normaliser last: the log densities above belong to the policy that played the rows.
     after = TrainState(params, optimiser_state, *_normalisers(state, rows), copies, state.update + 1, state.key)
     if state.reached is None:
         return after, stats

@@ -1,7 +1,7 @@
 """Training over several devices, of one host or of several: seeds and copies are divided, in one program.
 
-The devices are a row for each group of seeds, in which each has some of their copies. The policies of a sweep count as
-seeds.
+The mesh of devices has a row for each group of seeds; the devices of a row divide the copies of these seeds. The
+policies of a sweep count as seeds.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SEEDS, COPIES = "seeds", "copies"
 
 
 def mesh_of(config: PPOConfig) -> Mesh | None:
-    """Return the devices, those of a seed in a row; None for one device."""
+    """Return the mesh of devices, with the devices of a seed in a row; None for one device."""
     available = jax.local_devices()
     if config.devices > len(available):
         raise UsageError(
@@ -43,7 +43,7 @@ def mesh_of(config: PPOConfig) -> Mesh | None:
     if config.num_envs % by_copy:
         raise UsageError(
             f"{total} devices cannot divide {config.num_seeds} seeds of {config.num_envs} copies: "
-            f"{by_copy} devices a seed do not divide its copies",
+            f"{by_copy} devices for each seed do not divide its copies",
             hint=f"make num_envs a multiple of {by_copy}",
         )
     # Devices of one host are neighbours in the mesh.
@@ -53,9 +53,9 @@ def mesh_of(config: PPOConfig) -> Mesh | None:
 
 
 def divide_minibatches(arrays: T, config: PPOConfig) -> T:
-    """Return minibatches that the devices of a seed divide.
+    """Constrain minibatches so that the devices of a seed divide them.
 
-    A minibatch has copies from all devices. Without this constraint the compiler makes each device compute all of it.
+    A minibatch has copies from all devices. Without this constraint, the compiler makes each device compute all of it.
 
     Args:
         arrays: Leaves of shape ``(B, M, ...)``: B minibatches of M copies.
@@ -72,7 +72,7 @@ def divide_minibatches(arrays: T, config: PPOConfig) -> T:
 
 
 class Shardings(NamedTuple):
-    """Where the arrays of a training lie.
+    """The placement of a training's arrays on devices.
 
     Attributes:
         state: A sharding for each array of its state.
@@ -84,7 +84,7 @@ class Shardings(NamedTuple):
 
 
 def shardings_of(state: TrainState, config: PPOConfig) -> Shardings | None:
-    """Return where each array of a training's state goes; None for one device.
+    """Return the placement of each array of a training's state; None for one device.
 
     Seeds are divided first, as they are independent; the devices of a seed divide its copies. The compiler inserts the
     exchange of gradients. Random numbers do not depend on the division.
@@ -104,12 +104,12 @@ def shardings_of(state: TrainState, config: PPOConfig) -> Shardings | None:
 
 
 def place(state: T, layout: Shardings | None) -> T:
-    """Return a state on its devices; each process, which has the whole state in memory, puts its own part."""
+    """Put a state on its devices; each process has the whole state in memory, and puts its own part."""
     return jax.device_put(state) if layout is None else jax.tree.map(_put, state, layout.state)
 
 
 def replicate(tree: T, layout: Shardings | None) -> T:
-    """Return arrays with a copy on every device, from arrays in this process's memory."""
+    """Put a copy of arrays in this process's memory on every device."""
     return jax.device_put(tree) if layout is None else jax.tree.map(lambda leaf: _put(leaf, layout.whole), tree)
 
 
@@ -121,7 +121,7 @@ def _put(leaf: Array, where: NamedSharding) -> jax.Array:
 
 
 def gather(state: T, layout: Shardings | None) -> T:
-    """Return a state that this process can read, also the parts of other processes; all of them must call this."""
+    """Return a state that this process can read, with the parts of other processes; all processes must call this."""
     if layout is None or jax.process_count() == 1:
         return state
     return jax.jit(lambda state: state, out_shardings=layout.whole)(state)

@@ -14,13 +14,13 @@ class HostsConfig:
     found: bool = False
     """Join the processes that SLURM, Open MPI or Kubernetes started; JAX reads their addresses from the environment."""
     coordinator: str | None = None
-    """Address of process 0 that all others reach, HOST:PORT with a free port, for processes started by hand."""
+    """Address of process 0, HOST:PORT with a free port, which all others can reach; for processes started by hand."""
     processes: int | None = None
     """Number of processes started by hand."""
     process: int | None = None
     """Number of this process: 0, 1 ...; process 0 writes all files and shows progress."""
     timeout_s: int = 300
-    """Time to wait for a process that has not joined, or that no longer answers [s]."""
+    """Longest wait for a process that has not joined, or that no longer answers [s]."""
 
     def __post_init__(self) -> None:
         """Check the settings before any connection is made."""
@@ -62,7 +62,7 @@ class HostsConfig:
         try:
             addresses = sorted({str(info[4][0]) for info in socket.getaddrinfo(host, None)})
         except OSError:
-            return []  # the other processes cannot resolve it either: joining raises the error
+            return []  # the other processes cannot resolve the name, either: joining raises the error
         if not all(map(_is_loopback, addresses)):
             return []
         return [f"warning: {host} is {', '.join(addresses)} here, which no other host reaches: name a network address"]

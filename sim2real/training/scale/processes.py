@@ -1,4 +1,4 @@
-"""Several processes of one training: they join, compare their settings, and end with an error if one is lost."""
+"""Joins several processes of one training, compares their settings, and raises an error if one is lost."""
 
 import json
 import os
@@ -16,7 +16,7 @@ from sim2real.training.scale.hosts import HostsConfig
 from sim2real.types import Json
 
 _SHUTDOWN_S = 7 * 86400
-"""Time that a finished process waits for the others: the first one still evaluates and writes the policy [s]."""
+"""Time that a finished process waits for the others, as the first one still evaluates and writes the policy [s]."""
 _LOST = re.compile(r"gloo|nccl|coordination|heartbeat|barrier|deadline_exceeded|unavailable", re.IGNORECASE)
 _HINT = (
     "the reason is in the output of the process that ended first; `--resume newest` continues from the last evaluation"
@@ -27,7 +27,7 @@ def join(hosts: HostsConfig) -> None:
     """Join the other processes, before JAX computes anything."""
     if not hosts.several:
         return
-    # JAX's preemption service would catch SIGTERM: a launcher's time limit would not end the training.
+    # JAX's preemption service would catch SIGTERM, so that a launcher's time limit would not end the training.
     jax.config.update("jax_enable_preemption_service", False)
     try:
         jax.distributed.initialize(
@@ -38,7 +38,7 @@ def join(hosts: HostsConfig) -> None:
             initialization_timeout=hosts.timeout_s,
             heartbeat_timeout_seconds=hosts.timeout_s,
             shutdown_timeout_seconds=_SHUTDOWN_S,
-            # JAX's default is to listen on all interfaces.
+            # JAX would listen on all interfaces by default.
             coordinator_bind_address=os.environ.get("JAX_COORDINATOR_BIND_ADDRESS", hosts.coordinator),
         )
     except (ValueError, RuntimeError) as error:
@@ -76,7 +76,7 @@ def wait_for_all(what: str) -> None:
 
 
 def agree(settings: Mapping[str, Json]) -> None:
-    """Compare the settings of all processes; with different programs they would wait for each other without end."""
+    """Compare the settings of all processes: with different programs they would wait for each other forever."""
     if jax.process_count() == 1:
         return
 
@@ -93,14 +93,14 @@ def agree(settings: Mapping[str, Json]) -> None:
                 f"{n} = {first.get(n)} in process 0 and {other.get(n)} in process {number}" for n in names
             )
             raise UsageError(
-                f"the processes were not started alike: {differences}",
+                f"the processes were started with different settings: {differences}",
                 hint="start all of them with the same flags, code, versions and run folder",
             )
 
 
 @contextmanager
 def lost_process_errors() -> Iterator[None]:
-    """Turn transport errors into a ``Sim2RealError`` that names the cause: another process was lost."""
+    """Convert transport errors to a ``Sim2RealError`` that names the cause: another process was lost."""
     try:
         yield
     except (ValueError, jax.errors.JaxRuntimeError) as error:
