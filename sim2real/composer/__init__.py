@@ -50,7 +50,7 @@ _LAZY = {
 
 
 def __getattr__(name: str) -> object:
-    """Import what needs JAX, brax or gymnasium when it is first used."""
+    """Import names that need JAX, brax or gymnasium at their first use."""
     if name not in _LAZY:
         raise AttributeError(f"module 'sim2real.composer' has no attribute {name!r}")
     module, attribute = _LAZY[name]

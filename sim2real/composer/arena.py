@@ -25,7 +25,7 @@ BASE = """
   </visual>
 </mujoco>
 """
-"""dm_control's base arena, without the no-slip solver, which MJX does not have."""
+"""dm_control's base arena, without the no-slip solver, which MJX lacks."""
 
 
 @functools.cache
@@ -34,7 +34,7 @@ def _base() -> Model:
 
 
 class Arena(Entity):
-    """The entity at the top: global settings, and the parts that subclasses build.
+    """The root entity: global settings, and the parts that subclasses build.
 
     Args:
         name: Name of the model; default: the file's.

@@ -35,10 +35,10 @@ class cached_property(property):  # noqa: N801 - a decorator, called like dm_con
 
 
 class observable(cached_property):  # noqa: N801
-    """A method of an ``Observables`` class that returns an observable; evaluated when the entity is made.
+    """Decorates a method of an ``Observables`` class that returns an observable; evaluated when the entity is made.
 
-    A method of an entity or a task that takes ``physics`` may be decorated too, and so may a function of ``physics``:
-    it is then the observable's value itself, and stays callable.
+    A method of an entity or a task that takes ``physics``, or a function of ``physics``, may be decorated, too: its
+    result is then the value of the observable, and it stays callable.
     """
 
     _in_class = False
@@ -62,7 +62,7 @@ class observable(cached_property):  # noqa: N801
         return super().__get__(obj, owner)
 
     def __call__(self, *args: Any) -> Any:
-        """Return what the decorated function returns."""
+        """Call the decorated function."""
         getter: Any = self.fget
         return getter(*args)
 

@@ -50,7 +50,7 @@ class FreePropObservableMixin(ABC):
 
 
 class WithHooks(ABC):  # noqa: B024
-    """What runs at set times of an episode, of entities and of tasks; nothing, unless a subclass overrides it."""
+    """Hooks of entities and tasks, called at fixed times of an episode; they do nothing unless overridden."""
 
     def initialize_episode_mjcf(self, random_state: RandomState) -> None:  # noqa: B027
         """Change the models before they are compiled for an episode."""
@@ -69,7 +69,7 @@ class WithHooks(ABC):  # noqa: B024
 
 
 class Entity(WithHooks):
-    """A part of a world: a model, observables, and hooks that run at set times of an episode.
+    """A part of a world: a model, observables, and hooks that run at fixed times of an episode.
 
     Subclasses override ``_build``, not the constructor.
 
@@ -96,7 +96,7 @@ class Entity(WithHooks):
 
     @property
     def mjcf_model(self) -> Model:
-        """The model; an empty one at first, unless a subclass has its own."""
+        """The model; at first an empty one, unless a subclass makes another."""
         if self._default_model is None:
             self._default_model = self._make_model()
         return self._default_model
@@ -116,7 +116,7 @@ class Entity(WithHooks):
 
     @property
     def parent(self) -> Entity | None:
-        """The entity that this one is attached to, or None."""
+        """The entity to which this one is attached, or None."""
         return self._parent() if self._parent else None
 
     @property
@@ -151,7 +151,7 @@ class Entity(WithHooks):
         """Detach this entity from its parent, together with the entities below it.
 
         Raises:
-            NotAttachedError: When it has no parent.
+            NotAttachedError: It has no parent.
         """
         if self._parent is None:
             raise NotAttachedError("Cannot detach an entity that is not attached.")
@@ -161,7 +161,7 @@ class Entity(WithHooks):
             parent._attached.remove(self)
         self._parent = None
 
-    # -- hooks that get no action, unless they ask for it by a third parameter
+    # -- hooks, which get the action only if they have a third parameter
 
     def before_step(self, physics: BasePhysics, random_state: RandomState) -> None:
         """Act before a control step."""
@@ -175,7 +175,7 @@ class Entity(WithHooks):
         """Return vectors of the world, shape ``(..., 3)`` or ``(..., 2)``, in this entity's axes; same shape.
 
         Raises:
-            UsageError: When the last axis has another size.
+            UsageError: The last axis has another size.
         """
         xp = namespace(vec_in_world_frame, physics.bind(self.root_body).xmat)
         vector = xp.asarray(vec_in_world_frame)
@@ -199,14 +199,14 @@ class Entity(WithHooks):
         return xp.reshape(xp.reshape(xp.asarray(frame), (3, 3)).T @ xp.reshape(matrix, (3, 3)), matrix.shape)
 
     def _pose_holder(self) -> tuple[Element, bool]:
-        """Return the free joint or the frame that holds the pose, and whether it is a free joint."""
+        """Return the free joint or the frame that has the pose, and whether it is a free joint."""
         if self.mjcf_model.parent_model is None:
             raise NotAttachedError("No attachment frame found.", hint="only an attached entity has a pose")
         joint = get_frame_freejoint(self.mjcf_model)
         return (get_attachment_frame(self.mjcf_model), False) if joint is None else (joint, True)
 
     def get_pose(self, physics: BasePhysics) -> tuple[Array, Array]:
-        """Return position ``(3,)`` [m] and quaternion ``(4,)``: of the world with a free joint, else of the parent."""
+        """Return position ``(3,)`` [m] and quaternion ``(4,)``: in the world with a free joint, else in the parent."""
         holder, free = self._pose_holder()
         bound = physics.bind(holder)
         return (bound.qpos[:3], bound.qpos[3:]) if free else (bound.pos, bound.quat)
@@ -214,11 +214,11 @@ class Entity(WithHooks):
     def set_pose(
         self, physics: BasePhysics, position: ArrayLike | None = None, quaternion: ArrayLike | None = None
     ) -> None:
-        """Set position ``(3,)`` [m] and quaternion ``(4,)``, of the world with a free joint, else of the parent.
+        """Set position and quaternion: in the world with a free joint, else in the parent.
 
         Args:
-            position: ``(3,)`` [m]; None: it stays.
-            quaternion: ``(4,)``, scalar first; None: it stays.
+            position: ``(3,)`` [m]; None: unchanged.
+            quaternion: ``(4,)``, scalar first; None: unchanged.
         """
         holder, free = self._pose_holder()
         if quaternion is not None:
@@ -242,12 +242,12 @@ class Entity(WithHooks):
         quaternion: ArrayLike | None = None,
         rotate_velocity: bool = False,
     ) -> None:
-        """Move and turn from the present pose.
+        """Shift and turn the present pose.
 
         Args:
-            position: Added, ``(3,)`` [m].
-            quaternion: The turn, ``(4,)``; applied after the present one.
-            rotate_velocity: Turn the linear velocity too; the angular velocity is in the local frame.
+            position: Shift, ``(3,)`` [m].
+            quaternion: Turn, ``(4,)``, applied after the present orientation.
+            rotate_velocity: Whether to turn the linear velocity, too; the angular velocity is in the local frame.
         """
         old_position, old_quaternion = self.get_pose(physics)
         new_position = new_quaternion = None
@@ -277,11 +277,11 @@ class Entity(WithHooks):
     def set_velocity(
         self, physics: BasePhysics, velocity: ArrayLike | None = None, angular_velocity: ArrayLike | None = None
     ) -> None:
-        """Set linear ``(3,)`` [m/s] and angular velocity ``(3,)`` [rad/s]; warns when there is no free joint.
+        """Set linear and angular velocity; warns if there is no free joint.
 
         Args:
-            velocity: Linear, ``(3,)`` [m/s]; None: it stays.
-            angular_velocity: ``(3,)`` [rad/s, local frame]; None: it stays.
+            velocity: Linear velocity ``(3,)`` [m/s]; None: unchanged.
+            angular_velocity: ``(3,)`` [rad/s, local frame]; None: unchanged.
         """
         holder, free = self._pose_holder()
         if not free:
@@ -293,7 +293,7 @@ class Entity(WithHooks):
             physics.write(holder, "qvel", angular_velocity, slice(3, 6))
 
     def configure_joints(self, physics: BasePhysics, position: ArrayLike) -> None:
-        """Set the positions of this entity's own joints, frame joints of its children included."""
+        """Set the positions of this entity's joints, including frame joints of its children."""
         physics.set(self.mjcf_model.find_all("joint", exclude_attachments=True), "qpos", position)
 
 
@@ -302,7 +302,7 @@ class ModelWrapperEntity(Entity):
 
     def _build(self, mjcf_model: Model | MjSpec) -> None:
         if not isinstance(mjcf_model, Model):
-            mjcf_model.compile()  # MuJoCo writes compiled specs only
+            mjcf_model.compile()  # MuJoCo writes only compiled specs
             mjcf_model = Model.from_xml_string(mjcf_model.to_xml(), mjcf_model.assets)
         self._mjcf_model = mjcf_model
 

@@ -40,7 +40,7 @@ class ObservationPadding(Enum):
 
 
 class Observation(OrderedDict[str, PyTree]):
-    """Name -> array; a name may leave out the models in front of it as long as only one key ends with it."""
+    """Name -> array; the models before a name may be left out, if only one key ends with it."""
 
     def __missing__(self, key: str) -> PyTree:
         matches = [k for k in self if k.endswith(f"/{key}")]
@@ -55,16 +55,18 @@ class Environment(dm_env.Environment):
     Args:
         time_limit: Longest episode [s]; it ends after the first control step that reaches it.
         n_sub_steps: Physics steps in a control step; deprecated, set the task's time steps.
-        raise_exception_on_physics_error: Raise MuJoCo's warnings; else they end the episode with discount 0.
-        strip_singleton_obs_buffer_dim: Leave the first axis out of observations whose buffer holds one sample.
-        max_reset_attempts: How often a reset is tried when it raises ``EpisodeInitializationError``.
-        recompile_mjcf_every_episode: Run ``initialize_episode_mjcf`` and compile at every reset, not only at the first.
-        fixed_initial_state: Draw the same random numbers at every reset.
-        legacy_step: After a step, also compute positions and velocities of the new state.
-        arena: The root entity of a task that has none of its own.
+        raise_exception_on_physics_error: Whether to raise MuJoCo's warnings; otherwise they end the episode with
+            discount 0.
+        strip_singleton_obs_buffer_dim: Whether to leave out the first axis of observations with one sample.
+        max_reset_attempts: How often a reset is tried if it raises ``EpisodeInitializationError``.
+        recompile_mjcf_every_episode: Whether to run ``initialize_episode_mjcf`` and compile at every reset, not only at
+            the first.
+        fixed_initial_state: Whether to draw the same random numbers at every reset.
+        legacy_step: Whether to compute positions and velocities of the new state after a step.
+        arena: The root entity of a task that has none.
 
     Raises:
-        UsageError: When an option makes no sense.
+        UsageError: An option is out of its range.
     """
 
     def __init__(
@@ -112,13 +114,13 @@ class Environment(dm_env.Environment):
         self._steps_taken = 0
 
     def _build(self) -> None:
-        """Compile the models, if something in them has changed, and start from them."""
+        """If the models have changed, compile them; start from their initial state."""
         self._drop()
         model = self._task.root_entity.mjcf_model.root_model
-        text = model.to_xml_string()  # which names files by their contents
+        text = model.to_xml_string()  # the text names files by their contents
         if text != self._text:
             self._model, self._text = mj.MjModel.from_xml_string(text, model.get_assets()), text
-        # Each episode has memory of its own: arrays of earlier ones stay.
+        # Each episode has new memory, so that arrays of earlier episodes stay as they were.
         self._physics = Physics(copy.copy(self._model), self._legacy_step)
         self._proxy: PyTree = weakref.proxy(self._physics)
         steps = self._fixed_sub_steps or self._task.physics_steps_per_control_step
@@ -139,7 +141,7 @@ class Environment(dm_env.Environment):
 
     @property
     def physics(self) -> Physics:
-        """The physics, as a weak reference: it ends with the next compilation of the models and with ``close``."""
+        """The physics, as a weak reference, valid until the models are compiled again or ``close`` is called."""
         return self._proxy
 
     @property
@@ -154,15 +156,15 @@ class Environment(dm_env.Environment):
         return self._task.control_timestep
 
     def add_extra_hook(self, hook_name: str, hook_callable: Hook) -> None:
-        """Run a function after the hooks of the task and its entities; the arguments are those of the task's hook.
+        """Run a function after the hooks of the task and its entities, with the arguments of the task's hook.
 
         Raises:
-            UsageError: When there is no such hook, or the function is none.
+            UsageError: There is no such hook, or ``hook_callable`` is no function.
         """
         self._hooks.add(hook_name, hook_callable)
 
     def reset(self) -> dm_env.TimeStep:
-        """Start an episode; EpisodeInitializationError when the last attempt failed too."""
+        """Start an episode; raise EpisodeInitializationError if all attempts fail."""
         self._reset_next_step = True
         for attempt in range(1, self._max_reset_attempts + 1):
             try:
@@ -190,10 +192,10 @@ class Environment(dm_env.Environment):
         return dm_env.restart(self._observe())
 
     def step(self, action: PyTree) -> dm_env.TimeStep:
-        """Advance by a control step under an action; starts an episode when there is none, ignoring the action."""
+        """Advance by a control step under an action; without an episode, start one and ignore the action."""
         if self._reset_next_step:
             return self.reset()
-        # Run the hooks and the physics steps; a warning of MuJoCo ends the episode, unless it is an error.
+        # Run the hooks and the physics steps; a warning of MuJoCo ends the episode, or is raised.
         diverged = False
         self._hooks.run("before_step", self._proxy, action, self._random_state)
         self._updater.prepare_for_next_control_step()
@@ -202,7 +204,7 @@ class Environment(dm_env.Environment):
                 self._hooks.run("before_substep", self._proxy, action, self._random_state)
                 self._physics.step()
                 self._hooks.run("after_substep", self._proxy, self._random_state)
-                if i < self._n_sub_steps - 1:  # the last one is observed after the hooks that may change the state
+                if i < self._n_sub_steps - 1:  # the last step is observed after hooks that may change the state
                     self._updater.update()
         except PhysicsError as error:
             if self._raise_on_physics_error:
@@ -240,12 +242,12 @@ class Environment(dm_env.Environment):
         return self._updater.observation_spec()
 
     def reward_spec(self) -> PyTree:
-        """Return the task's reward spec, or that of a number."""
+        """Return the task's reward spec; default: a number."""
         spec = self._task.get_reward_spec()
         return super().reward_spec() if spec is None else spec
 
     def discount_spec(self) -> PyTree:
-        """Return the task's discount spec, or that of a number in [0, 1]."""
+        """Return the task's discount spec; default: a number in [0, 1]."""
         spec = self._task.get_discount_spec()
         return super().discount_spec() if spec is None else spec
 

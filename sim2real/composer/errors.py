@@ -1,4 +1,4 @@
-"""What can go wrong in a composed world."""
+"""Errors of composed worlds."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from sim2real.errors import Sim2RealError
 
 
 class PhysicsError(Sim2RealError, RuntimeError):
-    """MuJoCo warned: the state is not a number, the inertia singular, a buffer full."""
+    """MuJoCo warned, for example of a state that is not finite, a singular inertia or a full buffer."""
 
 
 class NotAttachedError(Sim2RealError, RuntimeError):

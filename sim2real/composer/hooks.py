@@ -1,4 +1,4 @@
-"""Which hooks run when: the task's, then those of the entities, depth first, then extra ones."""
+"""Runs hooks in order: the task's, then the entities', depth first, then extra ones."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ HOOK_NAMES = (
     "after_step",
 )
 WITH_ACTION = ("before_step", "before_substep")
-"""Hooks of the task, and extra ones, that are given the action too."""
+"""Hooks that get the action, for the task and for extra hooks."""
 
 
 class Hooks:
@@ -52,7 +52,7 @@ class Hooks:
         """Run a function after the hooks of the task and the entities.
 
         Raises:
-            UsageError: When there is no such hook, or the function is none.
+            UsageError: There is no such hook, or ``hook`` is no function.
         """
         if name not in HOOK_NAMES:
             raise UsageError(f"{name!r} is not a valid hook name. Available: {', '.join(HOOK_NAMES)}")
@@ -61,7 +61,7 @@ class Hooks:
         self._extra[name].append(hook)
 
     def run(self, name: str, *args: PyTree) -> None:
-        """Run all hooks of a name with the arguments that the task's hook takes."""
+        """Run all hooks with a name, with the arguments of the task's hook."""
         self.call(self._labels[name], getattr(self._task, name), *args)
         for label, hook in self._entity_hooks[name]:
             self.call(label, hook, *args)
@@ -76,13 +76,13 @@ class Hooks:
         return reward, discount, ends
 
     def call(self, label: str, function: Callable[..., T], *args: PyTree) -> T:
-        """Return what a function returns; ``label`` names it in errors."""
+        """Call a function; ``label`` names it in errors."""
         del label
         return function(*args)
 
 
 def _overrides(owner: Task | Entity, base: type, name: str) -> bool:
-    """Return whether an object has a hook of its own, in its class or as an attribute."""
+    """Return whether an object overrides a hook, in its class or as an attribute."""
     return name in vars(owner) or getattr(type(owner), name, None) is not getattr(base, name)
 
 
@@ -91,7 +91,7 @@ def _as_it_is(hook: Hook) -> Hook:
 
 
 def _with_action(hook: Hook) -> Hook:
-    """Return an entity's hook as a function of physics, action and randomness; most take no action."""
+    """Return an entity's hook as a function of physics, action and randomness; most hooks take no action."""
     try:
         parameters = inspect.signature(hook).parameters.values()
     except (TypeError, ValueError):

@@ -1,4 +1,4 @@
-"""How a part of a world is put into its initial state."""
+"""The base class of functions that set an initial state."""
 
 from __future__ import annotations
 

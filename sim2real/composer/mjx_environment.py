@@ -44,13 +44,13 @@ class State:
         leaves: Fields of the model that hooks set: name -> array.
         variables: Variables of the task between hooks: name -> array.
         key: Randomness.
-        memory: What variations keep from draw to draw: name -> array.
+        memory: Values that variations keep from draw to draw: name -> array.
         rings: Samples of the observables that may still be read.
         steps: int32: control steps since the reset.
-        dirty: Whether hooks set something after everything that follows from the state was last computed.
+        dirty: Whether hooks changed something after the derived quantities were last computed.
         observation: Name -> array.
         reward: Reward of the last step; 0 after a reset.
-        discount: Discount of what comes next, in [0, 1].
+        discount: Discount of the following rewards, in [0, 1].
         done: Whether the episode ended with the last step.
         truncated: Whether it ended only because of the time limit.
         failed: Whether no acceptable initial state was found in ``max_reset_attempts`` attempts.
@@ -77,31 +77,32 @@ class State:
 class MjxEnvironment:
     """Runs a task on MJX.
 
-    The hooks of the task and its entities are those of the C engine, called while the programs are traced: they read
-    and set the physics, compute with ``physics.np``, draw from ``random_state`` and keep values for later in
-    ``physics.variables``. ``initialize_episode_mjcf`` and ``after_compile`` run once, when the environment is made;
-    ``after_compile`` gets the C engine's physics, and the programs start from the model that it leaves.
+    The hooks of the task and its entities are the same as on the C engine, but are called while the programs are
+    traced: they read and set the physics, compute with ``physics.np``, draw from ``random_state`` and store values for
+    later in ``physics.variables``. ``initialize_episode_mjcf`` and ``after_compile`` run once, when the environment is
+    made; ``after_compile`` gets the C engine's physics, and its changes to the model are kept.
 
     Args:
         time_limit: Longest episode [s].
-        seed: For ``initialize_episode_mjcf`` and ``after_compile``, which run on the host.
-        strip_singleton_obs_buffer_dim: Leave the first axis out of observations whose buffer holds one sample.
-        max_reset_attempts: How often the initial state is drawn when hooks call ``physics.fail``.
-        legacy_step: After a step, also compute positions and velocities of the new state.
-        impl: ``"jax"``, or ``"warp"``: MuJoCo Warp, from the extra ``warp``. It computes in single precision
-            and has no derivatives.
-        nconmax: On Warp: contacts that there is room for, times the number of copies, which share it; default: a guess.
-        njmax: On Warp: rows of constraints that there is room for in each copy; default: a guess. Where it is too small
-            the episode of the copy ends, as where it diverged; where ``nconmax`` is, those of all copies.
-        arena: The root entity of a task that has none of its own.
+        seed: Seed for ``initialize_episode_mjcf`` and ``after_compile``, which run on the host.
+        strip_singleton_obs_buffer_dim: Whether to leave out the first axis of observations with one sample.
+        max_reset_attempts: How often the initial state is drawn if hooks call ``physics.fail``.
+        legacy_step: Whether to compute positions and velocities of the new state after a step.
+        impl: ``"jax"``, or ``"warp"``: MuJoCo Warp, from the extra ``warp``. It computes in single precision and has no
+            derivatives.
+        nconmax: On Warp: most contacts of a copy, on average, as copies share the room; default: a guess. If it is too
+            small, the episodes of all copies end.
+        njmax: On Warp: most rows of constraints of a copy; default: a guess. If it is too small, the episode of the
+            copy ends, as after divergence.
+        arena: The root entity of a task that has none.
 
     Raises:
-        UsageError: When the world asks for something that MJX does not do, or does otherwise; it names what.
+        UsageError: The world has something that MJX lacks or computes differently.
 
     Attributes:
         model: The compiled ``mujoco.MjModel``.
         mjx_model: The ``mjx.Model``.
-        initial: The ``mjx.Data`` that episodes start from.
+        initial: The ``mjx.Data`` from which episodes start.
         has_reward: Whether the task's ``get_reward`` returns anything but the number 0.
     """
 
@@ -148,11 +149,11 @@ class MjxEnvironment:
         self.mjx_model = mjx.put_model(self.model, impl="jax") if self._warp is None else self._warp.model
         self.initial = _initial_data(self.model) if self._warp is None else self._warp.start
         freeze(self.model)
-        # Trace once without physics to learn what a copy must carry.
+        # Trace once without physics to find the values that a copy must carry.
         self._changed: tuple[str, ...] = ()
         self.has_reward = self._stays_dirty = False
         self._steady = True
-        self._earned: PyTree = (np.zeros(()), np.zeros(()), {})  # like a reward, a discount and a reward's terms
+        self._earned: PyTree = (np.zeros(()), np.zeros(()), {})  # forms of a reward, a discount and a reward's terms
         self._discover()
 
     def _look_at_compiled(self, random_state: np.random.RandomState) -> None:
@@ -179,12 +180,12 @@ class MjxEnvironment:
         compiled = self.mjx_model if model is None else model
         data = initial if state is None else state.data
         physics = MjxPhysics(self.model, compiled, data, {}, self._legacy, self._warp)
-        physics.changed.update(self._changed)  # every copy carries every field that any hook sets
+        physics.changed.update(self._changed)  # every copy carries all fields that hooks set
         physics.switch_on()
         physics.start = initial
         physics.dry = dry
         if state is None:
-            # On Warp no quantity has been computed yet; a copy's own model is not the one of the initial data.
+            # On Warp nothing has been computed yet, and the copy's model differs from the model of the initial data.
             physics.is_dirty = self._warp is not None or model is not None
             memory = {k: jnp.asarray(v) for k, v in self._registry.initial.items()}
             return physics, JaxRandomState(None, memory, self._registry)
@@ -194,7 +195,7 @@ class MjxEnvironment:
         return physics, random_state
 
     def _discover(self) -> None:
-        """Trace resets and steps, without physics, to find out what hooks set and keep; programs must carry it."""
+        """Trace resets and steps without physics to find the values that hooks set, which programs must carry."""
         key = jax.random.key(0)
         action = jax.tree.map(lambda s: jnp.zeros(s.shape, jax.dtypes.canonicalize_dtype(s.dtype)), self._action_spec)
         with self._hooks.watching((self.task, *self.task.iter_entities())):
@@ -207,7 +208,7 @@ class MjxEnvironment:
         if missing:
             raise UsageError(
                 f"physics.variables {', '.join(map(repr, missing))} first appear in a step",
-                hint="set them in initialize_episode too: a compiled program carries the same variables all along",
+                hint="set them in initialize_episode, too: a compiled program always carries the same variables",
             )
         check_variables(state.variables, after.variables)
 
@@ -225,7 +226,7 @@ class MjxEnvironment:
 
         Args:
             model: The ``mjx.Model`` of this copy; default: the compiled one.
-            start: Positions ``(nq,)`` and velocities ``(nv,)`` that the hooks find; default: the model's, at rest.
+            start: Positions ``(nq,)`` and velocities ``(nv,)`` before the hooks; default: the model's, at rest.
         """
         return self._reset(key, model, start)
 
@@ -262,10 +263,10 @@ class MjxEnvironment:
         return State(data, leaves, variables, key, memory, rings, steps, dirty, *outcome)
 
     def step(self, state: State, action: jax.Array, model: mjx.Model | None = None) -> State:
-        """Return the copy one control step later; an episode that is over continues; see ``done``.
+        """Return the copy one control step later, even after the episode's end; see ``done``.
 
         Args:
-            action: Shape ``(nu,)``, unless the task has an ``action_spec`` of its own.
+            action: Shape ``(nu,)``, unless the task overrides ``action_spec``.
             model: The ``mjx.Model`` of this copy; default: the compiled one.
         """
         return self._step(state, action, model)
@@ -315,11 +316,11 @@ class MjxEnvironment:
             physics.is_dirty = entry if self._steady or self.substeps == 1 else dirty
             self._hooks.run("before_substep", physics, action, random_state)
             physics.step()
-            diverged = diverged | is_unstable(physics.mjx_data)  # now: hooks may write over it
+            diverged = diverged | is_unstable(physics.mjx_data)  # copy now: hooks may overwrite it
             self._hooks.run("after_substep", physics, random_state)
             now, counts = state.steps * self.substeps + i + 1, i < self.substeps - 1
             new = {r.name: r.update(rings[r.name], now, physics, random_state, counts) for r in buffered}
-            if physics.dry:  # is dirtiness the same before every physics step?
+            if physics.dry:  # whether ``dirty`` is the same before every physics step
                 self._steady = physics.is_dirty is entry
             dirty = jnp.asarray(physics.is_dirty, bool)
             return (physics.tree(random_state), {**rings, **new}, dirty, diverged), None
@@ -331,7 +332,7 @@ class MjxEnvironment:
             tree, rings, _, diverged = carry
         else:
             (tree, rings, dirty, diverged), _ = jax.lax.scan(substep, carry, jnp.arange(self.substeps, dtype=jnp.int32))
-            if not isinstance(physics.is_dirty, bool):  # otherwise no physics step changes it
+            if not isinstance(physics.is_dirty, bool):  # otherwise, no physics step changes it
                 physics.is_dirty = entry if self._steady else dirty
         physics.load(tree, random_state)
         return rings, diverged
@@ -341,7 +342,7 @@ class MjxEnvironment:
         return self._action_spec
 
     def carry(self, names: Iterable[str]) -> None:
-        """Have every copy keep fields of the model that it was reset with, for the steps, such as ``body_mass``."""
+        """Let every copy keep fields of the model of its reset, such as ``body_mass``, for the steps."""
         self._changed = tuple(sorted({*self._changed, *names}))
 
     def observation_spec(self) -> dict[str, jax.ShapeDtypeStruct]:
@@ -349,18 +350,18 @@ class MjxEnvironment:
         return dict(jax.eval_shape(self.reset, jax.random.key(0)).observation)
 
     def select(self, condition: jax.Array, a: State, b: State) -> State:
-        """Return copy ``a`` where the condition holds, else copy ``b``; e.g. to reset copies that are done."""
+        """Return copy ``a`` where the condition is true, else copy ``b``; e.g. to reset finished copies."""
         return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)
 
 
 def _initial_data(model: MjModel) -> mjx.Data:
     """Return the ``mjx.Data`` that an episode starts from: the model's initial state, with all computed quantities."""
-    physics = Physics(model)  # which computes everything, without the actuators
+    physics = Physics(model)  # computes all quantities, without the actuators
     return mjx.put_data(model, physics.data.ptr, impl="jax")
 
 
 def is_unstable(data: mjx.Data) -> jax.Array:
-    """Return whether MuJoCo would warn of an instability: a value that is not finite, or beyond its ``mjMAXVAL``."""
+    """Return whether MuJoCo would warn of an instability: a value is not finite, or beyond ``mjMAXVAL``."""
     state = jnp.concatenate([data.qpos, data.qvel, data.qacc])
     return ~(jnp.abs(state) <= mj.mjMAXVAL).all()
 

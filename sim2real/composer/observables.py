@@ -62,7 +62,7 @@ class Observables:
         return OrderedDict((prefix + name, value) for name, value in self._observables.items())
 
     def get_observable(self, name: str, name_fully_qualified: bool = False) -> Observable:
-        """Return an observable; KeyError when there is none of that name."""
+        """Return an observable; raise KeyError if there is none with the name."""
         if name_fully_qualified:
             name = name.removeprefix(self._entity.mjcf_model.full_identifier)
         try:
@@ -78,8 +78,8 @@ class Observables:
                 ``corruptor``, ``enabled``), or observable name -> options.
 
         Raises:
-            KeyError: When there is no observable of a name.
-            AttributeError: When there is no such option.
+            KeyError: There is no observable with a name.
+            AttributeError: There is no such option.
         """
         options = options or {}
         if options and OPTIONS.issuperset(options):
@@ -120,6 +120,6 @@ class Observables:
         if name in observables:
             return observables[name]
         declared = inspect.getattr_static(type(self), name, None)
-        if isinstance(declared, property):  # the property failed: its own error names the missing attribute
+        if isinstance(declared, property):  # the property failed: raise its error, which names the missing attribute
             return declared.__get__(self, type(self))
         raise AttributeError(f"{type(self).__name__} has no attribute {name!r}. Observables: {', '.join(observables)}")

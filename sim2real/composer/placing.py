@@ -1,4 +1,4 @@
-"""Placing props without contacts: on C and, a bounded number of times, inside a compiled program."""
+"""Places props without contacts, on C and, with a bounded number of attempts, in compiled programs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class PropPlacer(Initializer):
     Args:
         position: Position ``(3,)`` [m], or a variation.
         quaternion: Orientation ``(4,)``, or a variation.
-        ignore_collisions: Take the first pose, with or without contacts.
+        ignore_collisions: Whether to take the first pose, with or without contacts.
     """
 
     def __init__(
@@ -49,11 +49,11 @@ class PropPlacer(Initializer):
         """Place the props.
 
         Args:
-            ignore_contacts_with_entities: Entities that may be touched, such as those that are placed later.
+            ignore_contacts_with_entities: Entities that props may touch, such as entities that are placed later.
 
         Raises:
-            EpisodeInitializationError: When no pose without contact was found for a prop; on MJX ``physics.fail`` marks
-                the copies without one.
+            EpisodeInitializationError: No pose without contact was found for a prop; on MJX, ``physics.fail`` marks the
+                copies.
         """
         place = self._place_on_mjx if hasattr(physics, "retry") else self._place
         place(physics, random_state, list(ignore_contacts_with_entities or ()))
@@ -73,7 +73,7 @@ class PropPlacer(Initializer):
     # -- on C
 
     def _place(self, physics: Physics, random_state: RandomState, ignored: list[Entity]) -> None:
-        # Contacts with what is not placed yet are switched off: buffers of contacts may be small.
+        # Switch contacts with unplaced props off, because buffers of contacts may be small.
         off = [_switch_off(physics, entity) for entity in (*self._props, *ignored)]
         try:
             physics.forward()
@@ -111,10 +111,10 @@ class PropPlacer(Initializer):
 
         if is_warp(physics.mjx_model) and not self._ignore_collisions:
             raise UsageError(
-                "PropPlacer looks at the contacts of a copy, and MJX-Warp keeps those of all copies together",
+                "PropPlacer reads the contacts of a copy, and MJX-Warp stores contacts of all copies together",
                 hint='use impl="jax", or ignore_collisions=True',
             )
-        # Contacts cannot be switched off inside a program, so those with props that are placed later do not count.
+        # Contacts cannot be switched off in a program, so ignore contacts with props that are placed later.
         numbers = [_geoms(physics, prop) for prop in self._props]
         passed = [n for prop in ignored for n in _geoms(physics, prop)]
         for i, prop in enumerate(self._props):
@@ -139,11 +139,11 @@ def _geoms(physics: Any, prop: Entity) -> list[int]:
 
 
 _Contacts = tuple[Any, np.ndarray, np.ndarray]
-"""Bound geoms, and which contacts they had."""
+"""Bound geoms, and their contact masks."""
 
 
 def _switch_off(physics: Physics, entity: Entity) -> _Contacts | None:
-    """Switch contacts with an entity off; return what brings them back, None where it has no geoms."""
+    """Switch contacts with an entity off; return its contact masks to restore them, None without geoms."""
     geoms = physics.bind(entity.mjcf_model.find_all("geom"))
     if not len(geoms.element_id):
         return None
@@ -166,7 +166,7 @@ def _touches(physics: Physics, prop: Entity) -> bool:
 
 
 def _touches_on_mjx(physics: MjxPhysics, geoms: jax.Array, later: jax.Array) -> jax.Array:
-    """Return whether a geom of a prop touches one that counts."""
+    """Return whether a geom of a prop touches a geom that is not placed later."""
     import jax.numpy as jnp
 
     from sim2real.composer.physics.mjx.import_mjx import held_links, mjx

@@ -29,5 +29,5 @@ class Robot(Entity):
 
     @property
     def joints(self) -> list[Element]:
-        """The joints; default: all of the robot's own model."""
+        """The joints; default: all joints of the robot's own model."""
         return self.mjcf_model.find_all("joint", exclude_attachments=True)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from sim2real.types import PyTree
 
 UNLIMITED = 1e10
-"""Bound of an action that has none, in dm_control's specs."""
+"""Bound in dm_control's specs of an action without bounds."""
 
 
 def _steps(control_timestep: float, physics_timestep: float) -> int:
@@ -53,10 +53,10 @@ def count_steps(time_limit: float, control_timestep: float) -> float:
 
 
 def split_reward(reward: PyTree) -> tuple[PyTree, dict[str, PyTree]]:
-    """Return what a task's ``get_reward`` returned as a number, the sum of its terms in their order, and the terms.
+    """Return a task's reward as a number, the sum of its terms, and the terms by name.
 
     Raises:
-        UsageError: There are names, but no terms.
+        UsageError: The dictionary of terms is empty.
     """
     if not isinstance(reward, Mapping):
         return reward, {}
@@ -95,7 +95,7 @@ class Task(WithHooks):
 
     @property
     def task_observables(self) -> Mapping[str, Observable]:
-        """Name -> observable of what belongs to no entity."""
+        """Name -> observable, for observables that belong to no entity."""
         return OrderedDict()
 
     def _check_root_entity(self, name: str) -> None:
@@ -130,7 +130,7 @@ class Task(WithHooks):
         self.root_entity.mjcf_model.option.timestep = value
 
     def set_timesteps(self, control_timestep: float, physics_timestep: float) -> None:
-        """Set both time steps [s]; UsageError when a control step is no whole number of physics steps."""
+        """Set both time steps [s]; raise UsageError if a control step is no whole number of physics steps."""
         self._check_root_entity("set_timesteps")
         _steps(control_timestep, physics_timestep)
         self.root_entity.mjcf_model.option.timestep = physics_timestep
@@ -156,11 +156,11 @@ class Task(WithHooks):
         )
 
     def get_reward_spec(self) -> specs.Array | None:
-        """Return the spec of a reward that is no number; None: it is one."""
+        """Return the spec of the reward; None: a number."""
         return None
 
     def get_discount_spec(self) -> specs.BoundedArray | None:
-        """Return the spec of a discount that is no number in [0, 1]; None: it is one."""
+        """Return the spec of the discount; None: a number in [0, 1]."""
         return None
 
     # -- hooks
@@ -175,7 +175,7 @@ class Task(WithHooks):
 
     @abstractmethod
     def get_reward(self, physics: BasePhysics) -> PyTree:
-        """Return the reward of the step that was just taken, or its terms by name, whose sum it is."""
+        """Return the reward of the last step, or its terms by name, which are added up."""
 
     def should_terminate_episode(self, physics: BasePhysics) -> bool | Array:
         """Return whether the episode ends here; default: the result of ``get_termination``."""
@@ -187,7 +187,7 @@ class Task(WithHooks):
         return False
 
     def get_discount(self, physics: BasePhysics) -> float | Array:
-        """Return the discount of what comes after this step, in [0, 1]."""
+        """Return the discount of the rewards after this step, in [0, 1]."""
         del physics
         return 1.0
 

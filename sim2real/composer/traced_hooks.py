@@ -1,4 +1,4 @@
-"""Hooks run while a program is made, once. What that would freeze or cannot do is refused with the hook's name."""
+"""Calls hooks once, while a program is traced; refuses actions that tracing would freeze or cannot do."""
 
 from __future__ import annotations
 
@@ -79,14 +79,14 @@ _WORDS: tuple[tuple[type[Exception], str, str, str], ...] = (
         SET_BEFORE,
     ),
 )
-"""Error of JAX -> what the function did, why that does not work, what to do instead."""
+"""Error of JAX -> action of the hook, why it fails, what to do instead."""
 _IN_TEXT = {TypeError: "item assignment", ValueError: "read-only"}
-"""Words in the text of errors that are these ones."""
+"""Words in the text of the errors of JAX that are meant."""
 
 
 @contextlib.contextmanager
 def named(label: str) -> Iterator[None]:
-    """Say what a function did that a compiled program cannot do, rather than what JAX made of it."""
+    """Convert errors of JAX in a block to errors that name the hook and its mistake."""
     try:
         yield
     except Exception as error:
@@ -103,16 +103,16 @@ def _line(error: Exception) -> str:
 
 
 class TracedHooks(Hooks):
-    """Hooks that are called while programs are made.
+    """Hooks that are called while programs are traced.
 
     Attributes:
-        watched: The objects whose attributes hooks must not change; empty: none is looked at.
+        watched: Objects whose attributes hooks must not change.
     """
 
     watched: tuple[object, ...] = ()
 
     def call(self, label: str, function: Callable[..., T], *args: PyTree) -> T:
-        """Return what a function returns."""
+        """Call a hook, and refuse forbidden changes."""
         before = [_attributes(owner) for owner in self.watched]
         drawn = _drawn() if self.watched else None
         with named(label):
@@ -128,7 +128,7 @@ class TracedHooks(Hooks):
 
     @contextlib.contextmanager
     def watching(self, owners: Iterable[object]) -> Iterator[None]:
-        """Refuse changes of some objects' attributes inside a ``with`` block; if it fails, put them back."""
+        """Refuse changes of some objects' attributes in a ``with`` block; if it fails, restore them."""
         self.watched = tuple(owners)
         before = [dict(vars(owner)) for owner in self.watched]
         try:
@@ -143,7 +143,7 @@ class TracedHooks(Hooks):
 
 
 def _compare(label: str, owner: object, before: dict[str, object], after: dict[str, object]) -> None:
-    """Refuse changes: only absent attributes and None may be filled in, with no value of the simulation."""
+    """Refuse changes, except to set attributes that were absent or None, to values outside of the simulation."""
     for name in sorted({*before, *after}):
         old, new = before.get(name, _fingerprint(None)), after.get(name, _fingerprint(None))
         what = f"{type(owner).__name__}.{name}"
@@ -151,7 +151,7 @@ def _compare(label: str, owner: object, before: dict[str, object], after: dict[s
             continue
         if _has_tracer(vars(owner).get(name)):
             raise UsageError(
-                f"{what} was set by a hook, {label}, to a value that only exists in the program",
+                f"{what} was set by a hook, {label}, to a value that exists only in the program",
                 hint=f"keep it in physics.variables[{name!r}]: it then belongs to each copy",
             )
         if old != _fingerprint(None):
@@ -171,7 +171,7 @@ def _is_cache(owner: type, name: str) -> bool:
 
 
 class _Fingerprint(pickle.Pickler):
-    """Writes containers, arrays and a program's own objects by their contents, all else by its identity."""
+    """Pickles containers, arrays and the program's own objects by contents, other objects by identity."""
 
     def persistent_id(self, value: object) -> int | None:
         package = type(value).__module__.partition(".")[0]
@@ -180,11 +180,11 @@ class _Fingerprint(pickle.Pickler):
 
 
 def _fingerprint(value: object) -> bytes | int:
-    """Return a fingerprint of a value that changes with its contents; its identity where they cannot be read."""
+    """Return a fingerprint of a value's contents; its identity if the contents cannot be read."""
     file = io.BytesIO()
     try:
         _Fingerprint(file, protocol=pickle.HIGHEST_PROTOCOL).dump(value)
-    except Exception:  # what a lock or an open file holds is no matter of the simulation
+    except Exception:  # locks and open files do not belong to the simulation
         return id(value)
     return file.getvalue()
 

@@ -1,6 +1,6 @@
-"""Types that many modules of this package name in their annotations; only type checkers import this module.
+"""Types for annotations in this package; only type checkers import this module.
 
-MuJoCo's classes come from its compiled modules, which say nothing of their attributes.
+MuJoCo's compiled modules have no type information about attributes.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from mujoco._structs import MjvScene as MjvScene
 Array: TypeAlias = np.ndarray | jax.Array
 """Arrays of an engine: numpy's arrays on C, arrays and tracers of JAX on MJX."""
 ArrayLike: TypeAlias = npt.ArrayLike | jax.Array
-"""Values that an array can be made of; attributes in MJCF may be texts, too."""
+"""Values from which an array can be made; attributes in MJCF may be texts, too."""
 
 
 Draw: TypeAlias = Callable[..., Any]
-"""A function that draws a number or an array, of the parameters of a distribution and ``size``."""
+"""A function of a distribution's parameters and ``size`` that draws a number or an array."""
 
 
 class RandomState(Protocol):
@@ -44,7 +44,7 @@ class RandomState(Protocol):
 
 
 class CarriedRandomState(RandomState, Protocol):
-    """A ``JaxRandomState``: it carries values of variations from draw to draw."""
+    """A ``JaxRandomState``, which carries values of variations from draw to draw."""
 
     def recall(self, owner: Any, initial: Any) -> jax.Array:
         """Return the value of a variation at its last draw, or its initial value."""
@@ -55,12 +55,12 @@ class CarriedRandomState(RandomState, Protocol):
 
 
 Varying: TypeAlias = "ArrayLike | Callable[..., Any] | Sequence[Varying] | Mapping[str, Varying] | None"
-"""A value, a variation that draws one, or lists and dicts of these: what ``variation.evaluate`` takes."""
+"""A value, a variation that draws one, or lists and dicts of these; see ``variation.evaluate``."""
 
 Value: TypeAlias = Any
 """The value of an attribute in MJCF or in an ``MjSpec``: a number, a text, an array, an element, or a list of these."""
 Index: TypeAlias = Any
-"""A key of an array: a number, a slice, an array, or a tuple of these; names too where rows have names."""
+"""An index of an array: a number, a slice, an array, or a tuple of these; also names, if rows have names."""
 ArrayModule: TypeAlias = Any
 """The module of an engine's arrays: ``numpy`` or ``jax.numpy``."""
 

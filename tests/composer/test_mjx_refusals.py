@@ -126,7 +126,7 @@ def test_what_a_hook_cannot_do_is_refused_by_name(hooks, match):
         ({"option": 'noslip_iterations="3"'}, {}, "no-slip solver: option noslip_iterations is 3"),
         ({"actuator": 'delay="0.02" nsample="8"'}, {}, "delays and intervals: actuator 'torque'"),
         ({"option": 'integrator="implicit"'}, {}, "integrator mjINT_IMPLICIT"),
-        ({"flag": 'spring="disable"'}, {}, "springs and dampers where only one of them is disabled"),
+        ({"flag": 'spring="disable"'}, {}, "both springs and dampers if one of them is disabled"),
         ({}, {"impl": "warp"}, "mujoco-mjx"),  # which is not installed
         ({}, {"impl": "warp", "nconmax": 0}, "nconmax is a number of at least 1, got 0"),
         ({}, {"impl": "warp", "njmax": 0}, "njmax is a number of at least 1, got 0"),

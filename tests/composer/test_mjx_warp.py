@@ -283,7 +283,7 @@ def test_the_same_graph_runs_on_both(installed):
     [
         (("noslip_iterations", 3), "noslip_iterations is 3"),
         (("solver", "PGS"), "MJX-Warp cannot run this model: .*PGS"),
-        ("placer", "PropPlacer looks at the contacts of a copy"),
+        ("placer", "PropPlacer reads the contacts of a copy"),
         ("contacts", "a copy has no 'contact__dist' of its own"),
     ],
 )

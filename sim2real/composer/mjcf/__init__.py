@@ -1,4 +1,4 @@
-"""Models and elements under the names that PyMJCF gives them: ``mjcf.from_path``, ``mjcf.RootElement`` and so on."""
+"""Models and elements with PyMJCF's names: ``mjcf.from_path``, ``mjcf.RootElement`` and so on."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from sim2real.composer.mjcf.files import export_with_assets as export_with_asset
 from sim2real.composer.mjcf.files import export_with_assets_as_zip as export_with_assets_as_zip
 from sim2real.composer.mjcf.model import RootElement as RootElement
 
-element.RootElement = RootElement  # where PyMJCF has it too
+element.RootElement = RootElement  # as in PyMJCF
 
 PREFIX_SEPARATOR = "/"
-"""What stands between the names of models and of elements."""
+"""Separator between the names of models and elements."""
 
 from_xml_string = RootElement.from_xml_string
 from_path = RootElement.from_path
@@ -24,7 +24,7 @@ from_file = RootElement.from_file
 
 
 def get_attachment_frame(mjcf_model: RootElement) -> Any:
-    """Return the body that holds an attached model, or None; its own body, where that has a free joint."""
+    """Return the body that holds an attached model, or None; if the model has a body with a free joint, that body."""
     parent = mjcf_model.parent_model
     return None if parent is None else _compose.free_body(mjcf_model) or parent.frames[mjcf_model]
 
@@ -38,19 +38,19 @@ def get_freejoint(element: Element) -> Element | None:
 
 
 def get_frame_freejoint(mjcf_model: RootElement) -> Element | None:
-    """Return the free joint that moves an attached model: of its frame, or its own one; or None."""
+    """Return the free joint that moves an attached model, in its frame or in the model; or None."""
     frame = get_attachment_frame(mjcf_model)
     return None if frame is None else get_freejoint(frame)
 
 
 def get_frame_joints(mjcf_model: RootElement) -> list[Element] | None:
-    """Return all joints of the frame of an attached model, or None when it is not attached."""
+    """Return all joints of the frame of an attached model; None if it is not attached."""
     frame = get_attachment_frame(mjcf_model)
     return None if frame is None else [c for c in frame._children if c.kind == "joint"]
 
 
 def commit_defaults(element: Element, attributes: Iterable[str] | None = None) -> None:
-    """Give an element, as its own, the values that it takes from its classes of defaults.
+    """Copy the values that an element takes from its classes of defaults into its own attributes.
 
     Args:
         attributes: Names of the attributes; default: all.
@@ -63,7 +63,7 @@ def commit_defaults(element: Element, attributes: Iterable[str] | None = None) -
 
 
 def __getattr__(name: str) -> Any:
-    """Import the physics when it is first asked for: it needs the elements."""
+    """Import the physics at its first use, because it needs the elements."""
     if name in ("Physics", "Binding"):
         from sim2real.composer.physics.c import physics
 

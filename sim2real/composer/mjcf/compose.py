@@ -1,8 +1,8 @@
 """A model with all attached models as one document, which MuJoCo's parser compiles.
 
-Names of attached models' elements and classes are prefixed with ``model/``; elements without a name get one. Every
-class of defaults has a name, as the defaults of one model are not for another: those at the top are called ``/``, those
-of an attached model ``model/``.
+Names of elements and classes of attached models get the prefix ``model/``; elements without a name get a name. The
+defaults of one model do not apply to another, so every class has a name: ``/`` for the defaults of the root model,
+``model/`` for those of an attached model.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ if TYPE_CHECKING:
     from sim2real.types import MjModel
 
 _COSMETIC = ("material", "texture")
-"""Attributes that an element can do without: they may name something that was removed."""
+"""Attributes that an element does not need: they may refer to a removed element."""
 _ANGLES = ("range", "ref", "springref")
 _SPECIAL = re.compile('[&<>"\n\r\t]').search
 _FOLDERS = ("meshdir", "texturedir", "assetdir")
 
 
 def compile_model(model: RootElement) -> MjModel:
-    """Return the ``mujoco.MjModel`` of a model; ValueError with MuJoCo's own message when it does not compile."""
+    """Return the ``mujoco.MjModel`` of a model; raise ValueError with MuJoCo's message if it does not compile."""
     return mj.MjModel.from_xml_string(text(model), assets(model))
 
 
 def text(model: RootElement, precision: int = 17) -> str:
-    """Return a model as MJCF; what was written last, where nothing has changed since."""
+    """Return a model as MJCF; cached until the model changes."""
     models = [(one, one.changes) for one in model.all_models()]
     if model.written is not None:
         before, arrays, numbers, document = model.written
@@ -52,7 +52,7 @@ def text(model: RootElement, precision: int = 17) -> str:
 
 
 def element_text(element: Element, top: RootElement, self_only: bool, pretty: bool, precision: int) -> str:
-    """Return an element as MJCF, with names as seen from a model."""
+    """Return an element as MJCF, with names relative to the model ``top``."""
     writer = _Writer(top, element.root.root_model, precision)
     if self_only:
         attributes = writer.attributes(element)
@@ -71,7 +71,7 @@ def element_text(element: Element, top: RootElement, self_only: bool, pretty: bo
 
 
 def assets(model: RootElement) -> dict[str, bytes]:
-    """Return the contents of the files that a model and those attached to it name: name -> bytes."""
+    """Return name -> contents of the files of a model and of all attached models."""
     found = {}
     for element in model.walk():
         for value in element._given.values():
@@ -85,12 +85,12 @@ def _asset(element: Element, asset: files.Asset, top: RootElement) -> files.Asse
     prefix = element.root.prefix(top)
     if element._tag != "skin" or not prefix:
         return asset
-    # A file names bones by the names in its own model, which may have changed since.
+    # The file has the bones' names in its own model, which may have changed.
     return files.renamed_skin(asset, lambda bone: prefix + bone)
 
 
 class _Writer:
-    """Writes elements line by line; names are as seen from the model at the top."""
+    """Writes elements line by line, with names relative to the root model."""
 
     def __init__(self, top: RootElement, world: RootElement | None = None, precision: int = 17) -> None:
         self.top, self.world, self._number = top, world or top, f"%.{precision}g"
@@ -132,7 +132,7 @@ class _Writer:
         return "\n".join(self.lines)
 
     def setting(self, element: Element, depth: int) -> None:
-        """Write a section of settings, if there are any."""
+        """Write a section of settings, if it is not empty."""
         attributes = self.attributes(element)
         at = len(self.lines)
         for child in element._children:
@@ -141,7 +141,7 @@ class _Writer:
             self._around(element._tag, attributes, at, depth)
 
     def defaults(self, element: Element, depth: int = 0) -> None:
-        """Write a class of defaults; the classes of attached models stand beside those at the top."""
+        """Write a class of defaults; classes of attached models become siblings of the root model's."""
         if element._parent is not element.root:
             self.default(element, depth)
             return
@@ -179,9 +179,8 @@ class _Writer:
             parent = element._parent
             if children[: len(element._children)] or attached.parent_model is not self.top or not parent.is_worldbody:
                 raise UsageError(
-                    f"model {attached.model!r} has a free joint of its own: it can only be attached to the world, "
-                    "without joints",
-                    hint="take the free joint out of the model and use add_free_entity",
+                    f"model {attached.model!r} has a free joint: it can only be attached to the world, without joints",
+                    hint="remove the free joint from the model and use add_free_entity",
                 )
             tag = "frame"
             attributes.pop("name")
@@ -200,7 +199,7 @@ class _Writer:
         named_by = spec.named_by
         if spec.kind and named_by in spec.attributes and named_by != "class":
             made[named_by] = self._name(element)
-            if not made[named_by]:  # a composite at the top, whose elements are called as MuJoCo calls them
+            if not made[named_by]:  # a composite in the root model, whose elements MuJoCo names
                 del made[named_by]
         if "class" in spec.attributes and "class" not in given and element._tag != "default":
             by_model = self._class(element._parent or element)
@@ -235,7 +234,7 @@ class _Writer:
                 if one._spec.kind:
                     numbers[one] = counts[one._spec.kind]
                     counts[one._spec.kind] += 1
-        prefix = model.prefix(self.world)  # as PyMJCF does: the name in the compiled model
+        prefix = model.prefix(self.world)  # as in PyMJCF: the name in the compiled model
         return f"{prefix or '/'}/unnamed_{element.kind}_{numbers[element]}"
 
     def _prefix(self, model: RootElement) -> str:
@@ -244,7 +243,7 @@ class _Writer:
         return self._prefixes[model]
 
     def _class(self, above: Element) -> str | None:
-        """Return the class of an element in another one that names none; None where a body has one for its children."""
+        """Return the class of an element without a class; None if a body sets a class for its children."""
         if above not in self._classed:
             if above._given.get("childclass"):
                 found = None
@@ -256,7 +255,7 @@ class _Writer:
         return self._classed[above]
 
     def _text(self, element: Element, name: str, value: Any) -> str | None:
-        """Return the value of an attribute as text; None where it is not written."""
+        """Return the value of an attribute as text; None if it is not written."""
         if not isinstance(value, str):
             if hasattr(value, "_given"):
                 return self._named(element, name, value)
@@ -289,22 +288,22 @@ class _Writer:
             removed = target._key_order.get("name", [""])[0]
             raise UsageError(
                 f"{element.kind} {element._given.get('name') or element.full_identifier!r} of model "
-                f"{element.root.model!r} names the {target.kind} {removed!r}, which was removed",
-                hint=f"remove the {element.kind} as well, or let it name another {target.kind}",
+                f"{element.root.model!r} refers to the {target.kind} {removed!r}, which was removed",
+                hint=f"remove the {element.kind}, too, or let it refer to another {target.kind}",
             )
         return target.root.identify(target, self.top)
 
     # -- angles
 
     def _factor(self, model: RootElement) -> float:
-        """Return what angles of a model are multiplied by."""
+        """Return the factor from a model's angles to the root model's unit."""
         if model not in self._factors:
             one, other = model.is_degree, self.world.is_degree
             self._factors[model] = 1.0 if one == other else math.pi / 180 if one else 180 / math.pi
         return self._factors[model]
 
     def _turned(self, element: Element, factor: float) -> dict[str, str]:
-        """Return the attributes of an element that are angles, in the unit of the model at the top."""
+        """Return the attributes of an element that are angles, in the unit of the root model."""
         made, given = {}, element._given
         if "euler" in given and element._tag != "compiler":
             made["euler"] = self._digits(factor * given["euler"])
@@ -312,7 +311,7 @@ class _Writer:
             made["axisangle"] = self._digits(given["axisangle"] * [1.0, 1.0, 1.0, factor])
         if element._tag == "joint" and "range" in element._spec.attributes:
             scale = factor if turns(element) else 1.0
-            for name in _ANGLES:  # those of its classes too: a class may be for hinges and for slides
+            for name in _ANGLES:  # also attributes of its classes: a class may serve hinges and slides
                 value = inherited(element, name)
                 if value is not None:
                     made[name] = self._digits(scale * np.asarray(value))
@@ -323,7 +322,7 @@ class _Writer:
     # -- keyframes
 
     def _numbers(self, key: Element, body: str) -> dict[str, str]:
-        """Return the numbers of a keyframe of any model, for the whole world."""
+        """Return the numbers of a keyframe for the whole world."""
         alone = not self.top.frames
         names = key._key_order
         self.arrays += [key._given[name] for name in names]
@@ -336,7 +335,7 @@ class _Writer:
         return {name: self._spread(key, name, layout[1]) for name in names}
 
     def _spread(self, key: Element, name: str, model: MjModel) -> str:
-        """Return the numbers of an attribute of a keyframe for the whole world: those that it has, else the usual."""
+        """Return an attribute of a keyframe for the whole world; elements without numbers get their defaults."""
         values, order = key._given[name], key._key_order[name]
         everything = [entry for one in key.root.all_models() for entry in one.keyed_elements(name)]
         own = self._placed(order, name, model)
@@ -360,9 +359,9 @@ class _Writer:
         return self._digits(numbers)
 
     def _placed(self, order: list[Any], name: str, model: MjModel) -> list[tuple[int | None, int]]:
-        """Return where the numbers of elements are in the world, and how many; None for those that are gone.
+        """Return start and number of the elements' numbers in the world; None as the start of removed elements.
 
-        An element that was removed gives its numbers to one of the same name.
+        A removed element passes its numbers on to an element with the same name.
         """
         places: list[tuple[int | None, int]] = []
         for element, called, hint in order:
@@ -418,7 +417,7 @@ def classes(element: Element) -> Iterator[Element]:
 
 
 def inherited(element: Element, name: str) -> Any:
-    """Return an attribute of an element: its own, or that of its classes of defaults; None where none has it."""
+    """Return an attribute of an element, or of its classes of defaults; None if none of them has it."""
     if name in element._given:
         return element._given[name]
     holders: Iterator[Element | None]
@@ -436,12 +435,12 @@ def _upwards(default: Element | None) -> Iterator[Element]:
 
 
 def turns(joint: Element) -> bool:
-    """Return whether the range of a joint is one of angles."""
+    """Return whether a joint's range consists of angles."""
     return joint._tag == "joint" and inherited(joint, "type") not in ("slide", "free")
 
 
 def width_of(element: Element, name: str) -> int:
-    """Return how many numbers of a keyframe an element has, as far as its model tells."""
+    """Return how many numbers of a keyframe belong to an element, by its model alone."""
     if name in ("qpos", "qvel"):
         kind = "free" if element._tag == "freejoint" else inherited(element, "type")
         return {"free": 7, "ball": 4}.get(kind, 1) - (name == "qvel" and kind in ("free", "ball"))
@@ -452,7 +451,7 @@ def width_of(element: Element, name: str) -> int:
 
 
 def free_body(model: RootElement) -> Element | None:
-    """Return the first body of a model's own world that has a free joint, or None."""
+    """Return the first body in a model's world that has a free joint, or None."""
     for body in model._child("worldbody")._children:
         if body._tag == "body" and not body.is_frame:
             for joint in body._children:

@@ -23,7 +23,7 @@ _UNITS = {unit: 1 << 10 * (i + 1) for i, unit in enumerate("kmgtpe")}
 
 
 class NoSuchChildError(UsageError, AttributeError):
-    """MJCF has no such element there."""
+    """MJCF does not allow such an element there."""
 
 
 class Element:
@@ -37,7 +37,7 @@ class Element:
     """The model that an attachment frame holds."""
     _given: dict[str, Any]
     _key_order: dict[str, list[Any]]
-    """Of a keyframe: attribute -> the elements that its numbers belong to; of a removed element its name."""
+    """Only for a keyframe: attribute -> the elements to which its numbers belong, or the names of removed ones."""
     _root: RootElement
     _tag: str
     is_removed: bool
@@ -63,7 +63,7 @@ class Element:
     def __dir__(self) -> list[str]:
         return sorted({*object.__dir__(self), *map(_public, self._spec.attributes), *self._spec.children})
 
-    # -- what it is
+    # -- identity
 
     @property
     def tag(self) -> str:
@@ -72,12 +72,12 @@ class Element:
 
     @property
     def spec(self) -> schema.Spec:
-        """What MJCF says of such an element: its attributes and children."""
+        """The attributes and children that MJCF allows."""
         return self._spec
 
     @property
     def kind(self) -> str:
-        """What ``find`` calls it: ``actuator`` for a ``<motor>``; ``body`` for the world too."""
+        """The kind for ``find``: ``actuator`` for a ``<motor>``; ``body`` also for the world."""
         return "body" if self.tag == "worldbody" else self._spec.kind or self.tag
 
     @property
@@ -87,12 +87,12 @@ class Element:
 
     @property
     def namescope(self) -> RootElement:
-        """Whose names this element's are: the model's."""
+        """The model in which the element's name is unique."""
         return self._root
 
     @property
     def parent(self) -> Any:
-        """The element that holds this one."""
+        """The element above this one."""
         return self._parent
 
     @property
@@ -102,16 +102,16 @@ class Element:
 
     @property
     def is_frame(self) -> bool:
-        """Whether this is the frame that another model is attached to."""
+        """Whether this is the frame of an attached model."""
         return self._attached is not None
 
     @property
     def full_identifier(self) -> Any:
-        """The name in the compiled model, such as ``arm/hand/finger``; None where elements have no names."""
+        """The name in the compiled model, such as ``arm/hand/finger``; None if such elements have no names."""
         return self._root.identify(self)
 
     def prefixed_identifier(self, prefix_root: RootElement | None = None) -> str | None:
-        """Return the name as seen from a model, this element's own by default."""
+        """Return the name relative to a model; default: the element's own model."""
         return self._root.identify(self, prefix_root or self._root)
 
     @property
@@ -120,15 +120,15 @@ class Element:
         return self._tag if parent is None or parent is self._root else f"{parent._tag}.{self._tag}"
 
     def _note_change(self) -> None:
-        """Note that the text of the model may differ from now on."""
+        """Note that the cached text of the model is out of date."""
         object.__setattr__(self._root, "changes", next(_CHANGES))
-        if self._root.parent_model is not None and self._is_setting:  # it belongs to the model at the top
+        if self._root.parent_model is not None and self._is_setting:  # the cache belongs to the root model
             object.__setattr__(self._root.root_model, "changes", next(_CHANGES))
 
     # -- attributes
 
     def _values(self, name: str) -> dict[str, Any]:
-        """Return where an attribute is kept: settings of attached models are those of the model at the top."""
+        """Return where an attribute is stored: attached models share the settings of the root model."""
         top = self._root.root_model
         if top is self._root or name in schema.OWN_SETTINGS or not self._is_setting:
             return self._given
@@ -164,7 +164,7 @@ class Element:
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
-        if hasattr(type(self), name):  # a property of this class failed: let its own error be seen
+        if hasattr(type(self), name):  # a property of this class failed: raise its own error
             return object.__getattribute__(self, name)
         spec = self._spec
         if name in spec.children and not self.is_removed:
@@ -211,7 +211,7 @@ class Element:
             self._key_order[name] = self._root.keyed_elements(name)
 
     def _converted(self, name: str, value: Any) -> Any:
-        """Return the value of an attribute as it is kept."""
+        """Return the value of an attribute in the form in which it is stored."""
         target = schema.reference(self._path, self._tag, name)
         if target is not None:
             return self._converted_reference(name, target, value)
@@ -241,7 +241,7 @@ class Element:
             return str(bool(value)).lower()
         if isinstance(value, str):
             return value
-        if isinstance(value, np.ndarray | list | tuple):  # an attribute that is newer than the tables
+        if isinstance(value, np.ndarray | list | tuple):  # the attribute is newer than the tables
             return np.atleast_1d(np.array(value))
         return str(value)
 
@@ -273,7 +273,7 @@ class Element:
         return {_public(name): v for name, v in found.items() if v is not None}
 
     def set_attributes(self, **attrs: Any) -> None:
-        """Set several attributes, or none where one of them is not valid."""
+        """Set several attributes, or none if one of them is not valid."""
         attrs = {self._checked(k): v for k, v in attrs.items()}
         before = {name: self._values(name).get(name) for name in attrs}
         done = []
@@ -295,17 +295,18 @@ class Element:
         return None
 
     def _child(self, tag: str) -> Element:
-        """Return a child that is there without being added."""
+        """Return a child that exists without being added."""
         child = self._present(tag)
         if child is None:
             child = Element(self._spec.children[tag], self)
             place = len(self._children)
-            if self._tag in ("default", "mujoco"):  # in MJCF's order, whenever it is first used
+            if self._tag in ("default", "mujoco"):  # in MJCF's order, not in the order of use
                 order = list(self._spec.children)
                 later = order[order.index(tag) :]
                 place = next((i for i, c in enumerate(self._children) if c._tag in later), place)
             self._children.insert(place, child)
-            if self is self._root and self._root.parent_model is not None:  # sections hold those of attached models
+            # Sections also contain the elements of attached models.
+            if self is self._root and self._root.parent_model is not None:
                 self._root.parent_model._child(tag)
         return child
 
@@ -316,15 +317,15 @@ class Element:
         return getattr(self, tag)
 
     def add(self, tag: str, **attrs: Any) -> Element:
-        """Add an element behind the others.
+        """Add an element after the others.
 
         Raises:
-            UsageError: When such an element cannot stand here, or an attribute is not valid.
+            UsageError: Such an element is not allowed here, or an attribute is not valid.
         """
         return self.insert(tag, None, **attrs)
 
     def insert(self, tag: str, position: int | None, **attrs: Any) -> Element:
-        """Add an element before another one, by its number; None: behind all."""
+        """Add an element before the child with number ``position``; None: after all others."""
         spec = self._spec.children.get(tag)
         if spec is None or (self.is_frame and tag not in schema.FRAME_CHILDREN):
             available = ", ".join(schema.FRAME_CHILDREN if self.is_frame else sorted(self._spec.children))
@@ -334,7 +335,7 @@ class Element:
             raise UsageError(f"A <{tag}> child already exists in <{self._tag}>, please access it directly.")
         if tag == "freejoint" and not self._stands_in_the_world:
             raise NoSuchChildError(
-                f"<freejoint> is not a valid child of {self.full_identifier!r}, which does not stand in the world",
+                f"<freejoint> is not a valid child of {self.full_identifier!r}, which is not in the world",
                 hint="attach the model to the world, or use hinge and slide joints",
             )
         self._note_change()
@@ -365,7 +366,7 @@ class Element:
         """Delete the element from its model, with its children.
 
         Args:
-            affect_attachments: Whether models that are attached below it may be detached.
+            affect_attachments: Whether to detach models that are attached below it; otherwise they are an error.
         """
         self._note_change()
         below = [e for e in self.walk(own=True) if e._attached is not None]
@@ -392,7 +393,7 @@ class Element:
             self.is_removed = True
 
     def all_children(self) -> list[Element]:
-        """Return the children, and those of the model that an attachment frame or a section holds too."""
+        """Return the children, also those of models in an attachment frame or a section."""
         for tag, spec in self._spec.children.items():
             if spec.implicit:
                 self._child(tag)
@@ -414,7 +415,7 @@ class Element:
         return []
 
     def walk(self, own: bool = False) -> Iterator[Element]:
-        """Yield this element and all below it, in the order of the document; ``own``: without attached models."""
+        """Yield this element and all below it, in document order; ``own``: without attached models."""
         waiting: list[Element] = [self]
         while waiting:
             element = waiting.pop()
@@ -422,7 +423,7 @@ class Element:
             waiting.extend(reversed(element._children if own else element._with_attached()))
 
     def find(self, namespace: str, identifier: str | None = None, *, name: str | None = None) -> Any:
-        """Return the element of a kind with a name such as ``finger`` or ``hand/finger`` below this one, or None."""
+        """Return the element of a kind below this one, by a name such as ``finger`` or ``hand/finger``, or None."""
         found = self._root.look_up(namespace, identifier if identifier is not None else name)
         above = found
         while isinstance(above, Element) and above is not self and self is not self._root:
@@ -469,7 +470,7 @@ class Element:
 
     @property
     def _says(self) -> bool:
-        """Whether the element is more than an empty one that is there without being added."""
+        """Whether the element has content or was added explicitly."""
         return not self._spec.implicit or bool(self._given) or any(c._says for c in self._with_attached())
 
     def is_same_as(self, other: Element | None) -> bool:
@@ -484,7 +485,7 @@ class Element:
             np.array_equal(np.asarray(mine[k]), np.asarray(theirs[k])) for k in mine
         ):
             return False
-        ordered = self.kind == "tendon"  # the order of a path counts
+        ordered = self.kind == "tendon"  # compare the order of a path's elements
         for tag in (None,) if ordered else self._spec.children:
             one, two = ([c for c in e._with_attached() if tag in (None, c._tag) and c._says] for e in (self, other))
             if len(one) != len(two) or not all(a.is_same_as(b) for a, b in zip(one, two, strict=True)):
@@ -492,7 +493,7 @@ class Element:
         return True
 
     def resolve_references(self) -> None:
-        """Let attributes that name elements by text hold the elements."""
+        """Replace names of elements in attributes by the elements."""
         self._note_change()
         for element in self.walk():
             for name, value in element._given.items():
@@ -512,10 +513,10 @@ class Element:
         """Return this element as MJCF.
 
         Args:
-            prefix_root: The model that names are relative to; default: the element's own.
-            precision: Significant digits of numbers; with 17 they are exact.
+            prefix_root: The model to which names are relative; default: the element's own.
+            precision: Significant digits of numbers; 17 digits are exact.
         """
-        from sim2real.composer.mjcf import compose  # which walks over elements
+        from sim2real.composer.mjcf import compose  # imported late: it walks over elements
 
         return compose.element_text(self, prefix_root or self._root, self_only, pretty_print, precision)
 
@@ -525,18 +526,18 @@ def _public(name: str) -> str:
 
 
 def _types_first(name: str) -> bool:
-    """Sort attributes that say what others name before those."""
+    """Sort key: attributes such as ``objtype`` precede the attributes that depend on them."""
     return not name.endswith("type")
 
 
 def bytes_of(text: str) -> int:
-    """Return the number of bytes that ``size.memory`` asks for."""
+    """Return the number of bytes in ``size.memory``."""
     unit = _UNITS.get(text[-1:].lower(), 1)
     return int(text[:-1] if unit > 1 else text) * unit
 
 
 class ElementList(Sequence[Element]):
-    """Children with one tag, such as ``body.geom`` and ``sensor.gyro``; always those that are there now."""
+    """A live list of the children with one tag, such as ``body.geom`` and ``sensor.gyro``."""
 
     def __init__(self, parent: Element, tag: str) -> None:
         self._parent, self._tag = parent, tag
@@ -576,7 +577,7 @@ class ElementList(Sequence[Element]):
         return repr(self._find())
 
     def clear(self) -> None:
-        """Delete them all."""
+        """Delete all elements of the list."""
         for element in self._find():
             element.remove()
 
@@ -589,10 +590,10 @@ def as_elements(elements: Elements) -> tuple[tuple[Element, ...], bool]:
     """Return elements as a tuple, and whether the argument was a single element.
 
     Raises:
-        UsageError: When something in it is no element, or the kinds differ.
+        UsageError: Something is no element, or the kinds differ.
     """
     if elements is None:
-        raise UsageError("nothing to bind: the element is None", hint="find() returns None where it finds nothing")
+        raise UsageError("nothing to bind: the element is None", hint="find() returns None if it finds nothing")
     if isinstance(elements, Element) or not isinstance(elements, Iterable):
         sequence: tuple[Element, ...] = (elements,)
     else:

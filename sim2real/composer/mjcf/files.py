@@ -1,4 +1,4 @@
-"""Files of meshes, textures and height fields: read when they are named, written beside an exported model."""
+"""Files of meshes, textures and height fields: read when an attribute names them, written with an exported model."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 TAGS = ("mesh", "hfield", "texture", "skin", "model", "flexcomp")
 """Elements that may come from files."""
 NAMED_AFTER = ("mesh", "hfield", "texture")
-"""Elements that are called after their files, where they have no name."""
+"""Elements that are named after their files if they have no name."""
 _NAME_BYTES = 40
 
 
 class NoSuchFileError(UsageError, OSError):
-    """A file that a model names is not there."""
+    """A file of a model does not exist."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Asset:
     """The contents of a file: ``asset.add('texture', file=mjcf.Asset(png, '.png'))``.
 
     Args:
-        extension: How the file's name ends, such as ``.stl``.
+        extension: Extension of the file's name, such as ``.stl``.
     """
 
     contents: bytes
@@ -41,13 +41,13 @@ class Asset:
     prefix: str = ""
 
     def get_vfs_filename(self) -> str:
-        """Return a name that no file with other contents has."""
+        """Return a name that is unique for these contents."""
         digest = hashlib.sha1(self.contents, usedforsecurity=False).hexdigest()
         return "-".join(filter(None, (self.prefix, digest))) + self.extension
 
 
 def read(element: Element, file: str) -> Asset:
-    """Return the file that an element names: among the model's assets, or below the model's folder."""
+    """Return the file of an element, from the model's assets or from the model's folder."""
     model = element.root
     compiler = model.compiler
     folder = compiler.texturedir if element.tag == "texture" else compiler.meshdir
@@ -93,7 +93,7 @@ def renamed_skin(asset: Asset, name: Callable[[str], str]) -> Asset:
 def export_with_assets(
     mjcf_model: RootElement, out_dir: str | os.PathLike[str], out_file_name: str | None = None
 ) -> None:
-    """Write a model, composed, as MJCF with all its files into a folder, which is made if it is not there.
+    """Write a composed model as MJCF with all its files into a folder, which is created if it is missing.
 
     Args:
         out_file_name: Name of the MJCF file; default: the model's name with ``.xml``.
@@ -111,7 +111,7 @@ def export_with_assets(
 def export_with_assets_as_zip(
     mjcf_model: RootElement, out_dir: str | os.PathLike[str], model_name: str | None = None
 ) -> str:
-    """Write a model, composed, as MJCF with all its files into an archive; return its path."""
+    """Write a composed model as MJCF with all its files into an archive; return its path."""
     name = model_name or mjcf_model.model
     Path(out_dir).mkdir(parents=True, exist_ok=True)
     path = str(Path(out_dir) / f"{name}.zip")

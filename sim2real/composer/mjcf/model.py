@@ -1,4 +1,4 @@
-"""A model: the tree of one entity, and the models that are attached to it."""
+"""A model: the MJCF tree of one entity, with the models that are attached to it."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 _MOST_INCLUDES = 50
-"""Largest number of documents that include each other in a row."""
+"""Largest depth of documents that include each other."""
 SETTINGS = ("compiler", "option", "size", "statistic", "visual")
 
 
 class RootElement(Element):
-    """The physical parts of one entity, as an MJCF tree; models attached to it keep trees of their own.
+    """The physical parts of one entity, as an MJCF tree; attached models keep their own trees.
 
     Attributes:
-        parent_model: The model that this one is attached to, or None.
+        parent_model: The model to which this one is attached, or None.
         frames: Attached model -> its frame, in the order of attachment.
         assets: Name of a file -> its contents, for files that are given in memory.
-        model_dir: Where relative paths of files begin.
-        is_document: Whether a document gave it, whose angles are in degrees unless it says otherwise.
-        changes: A number that is another one after every change, but not after writing into an attribute's array.
-        written: What ``to_xml_string`` returned, and what it depends on.
+        model_dir: Folder to which paths of files are relative.
+        is_document: Whether it was read from a document, in which angles are in degrees by default.
+        changes: A number that every change alters, except writing into an attribute's array.
+        written: Cached result of ``to_xml_string``, with its arguments.
     """
 
     __slots__ = (
@@ -67,9 +67,10 @@ class RootElement(Element):
         """Return a model from MJCF.
 
         Args:
-            assets: Contents of files by name: they are looked for there first.
-            model_dir: Where relative paths of files begin; default: the working directory.
-            resolve_references: False: attributes that name elements read as text until ``resolve_references()``.
+            assets: Contents of files by name, which are searched first.
+            model_dir: Folder to which paths of files are relative; default: the working directory.
+            resolve_references: Whether attributes that refer to elements return elements; otherwise they return names
+                until ``resolve_references()``.
         """
         return _from_text(xml_string, "the document", Path(model_dir), assets or {}, resolve_references)
 
@@ -121,7 +122,7 @@ class RootElement(Element):
     def __deepcopy__(self, memo: dict[int, Any]) -> RootElement:
         copies: dict[Element, Element] = {}
         made = _copied(self, copies)
-        for element in copies.values():  # what names an element of the copied models names its copy
+        for element in copies.values():  # references to elements of the copied models become references to the copies
             for name, value in element._given.items():
                 if isinstance(value, Element):
                     element._given[name] = copies.get(value, value)
@@ -153,12 +154,12 @@ class RootElement(Element):
 
     @property
     def root_model(self) -> RootElement:
-        """The model at the top, that all others are attached to."""
+        """The root model, to which all others are attached."""
         return self if self.parent_model is None else self.parent_model.root_model
 
     @property
     def full_identifier(self) -> str:
-        """The prefix of all names in this model once it is compiled: ``''`` at the top, else ``arm/hand/``."""
+        """The prefix of all names in this model when it is compiled: ``''`` for the root model, else ``arm/hand/``."""
         return self.prefix(self.root_model)
 
     def all_models(self) -> Iterator[RootElement]:
@@ -168,7 +169,7 @@ class RootElement(Element):
             yield from model.all_models()
 
     def prefix(self, top: RootElement) -> str:
-        """Return the prefix of this model's names as seen from a model above."""
+        """Return the prefix of this model's names relative to a model above."""
         if self is top:
             return ""
         if self.parent_model is None:
@@ -179,7 +180,7 @@ class RootElement(Element):
         return f"{self.parent_model.prefix(top)}{self.model}/"
 
     def identify(self, element: Element, top: RootElement | None = None) -> str | None:
-        """Return the name of an element of this model as seen from a model above, or from the top."""
+        """Return the name of an element of this model relative to a model above; default: the root model."""
         prefix = self.prefix(top or self.root_model)
         if element.is_worldbody:
             return prefix or "world"
@@ -193,14 +194,14 @@ class RootElement(Element):
         parent = element._parent
         if parent is not None and parent.is_frame:
             return f"{self.identify(parent, top)}{name}/" if name else self.identify(parent, top)
-        if name or element.tag == "composite":  # its elements are called as MuJoCo calls them, below the model
+        if name or element.tag == "composite":  # MuJoCo names its elements; the model's prefix precedes these names
             return prefix + (name or "")
         peers = self.find_all(element.kind, exclude_attachments=True)
         number = next(i for i, peer in enumerate(peers) if peer is element)
         return f"{prefix or '/'}/unnamed_{element.kind}_{number}"
 
     def rename(self, element: Element, old: str | None, new: str | None) -> None:
-        """Give an element of this model another name; UsageError when it cannot have it."""
+        """Give an element of this model another name; raise UsageError if the name is not allowed."""
         parent = element._parent
         if new is not None and (not isinstance(new, str) or "/" in new):
             raise UsageError(f"{element.kind} name {new!r} is no text without '/', which separates the names of models")
@@ -217,7 +218,7 @@ class RootElement(Element):
             names[new] = element
 
     def get(self, kind: str, identifier: str) -> Any:
-        """Return the element of a kind with a name; KeyError when there is none."""
+        """Return the element of a kind with a name; raise KeyError if there is none."""
         found = self.look_up(kind, identifier)
         if found is None:
             raise KeyError(f"there is no {kind} {identifier!r}")
@@ -227,7 +228,7 @@ class RootElement(Element):
         """Return the element of a kind with a name in this model or those attached, or None.
 
         Args:
-            kind: Of elements, or ``attachment_frame``, ``attached_model``.
+            kind: Kind of elements, or ``attachment_frame``, ``attached_model``.
         """
         if not isinstance(kind, str) or not isinstance(identifier, str):
             raise UsageError(f"find needs a kind and a name, got {kind!r} and {identifier!r}")
@@ -259,7 +260,7 @@ class RootElement(Element):
         return self.worldbody.attach(attachment)
 
     def adopt(self, model: RootElement) -> None:
-        """Make a model one of those attached, before it has a frame; UsageError when it cannot be."""
+        """Register a model as attached, before it has a frame; raise UsageError if it cannot be attached."""
         if not isinstance(model, RootElement):
             raise UsageError(f"Expected a mjcf.RootElement: got {type(model).__name__}: {model!r}")
         if model.parent_model is not None:
@@ -278,7 +279,7 @@ class RootElement(Element):
         self._warn_of_degrees(model)
 
     def _warn_of_degrees(self, model: RootElement) -> None:
-        """Warn where dm_control would read a document's angles in another unit than MuJoCo, which reads degrees."""
+        """Warn if dm_control would read a document's angles in another unit than MuJoCo, which reads degrees."""
         if self.is_degree or not model.is_document or model.compiler.angle is not None:
             return
         joints = model.find_all("joint", exclude_attachments=True)
@@ -293,11 +294,11 @@ class RootElement(Element):
             )
 
     def detach(self) -> None:
-        """Take this model off the one that it is attached to."""
+        """Detach this model from the model to which it is attached."""
         parent = self.parent_model
         if parent is None:
             raise UsageError(f"Cannot detach model {self.model!r}: it is not attached")
-        for section in [c for c in self.root_model._children if c.tag in SETTINGS]:  # they stay as they were shared
+        for section in [c for c in self.root_model._children if c.tag in SETTINGS]:  # settings stay as they were shared
             for element in section.walk(own=True):
                 kept = {k: copy.copy(v) for k, v in element._given.items() if k not in schema.OWN_SETTINGS}
                 element._in(self)._given.update(kept)
@@ -310,7 +311,7 @@ class RootElement(Element):
     # -- keyframes
 
     def keyed_elements(self, name: str) -> list[Any]:
-        """Return the elements that the numbers of a keyframe's attribute belong to, with their names and widths."""
+        """Return the elements to which the numbers of a keyframe's attribute belong, with names and widths."""
         elements = self.find_all(schema.KEYED[name], exclude_attachments=True)
         if schema.KEYED[name] == "body":
             elements = [e for e in elements if e._given.get("mocap") == "true"]
@@ -319,16 +320,16 @@ class RootElement(Element):
     # -- compiling
 
     def compile(self) -> MjModel:
-        """Return the ``mujoco.MjModel`` of this model with all attached models; ValueError with MuJoCo's message."""
+        """Return the ``mujoco.MjModel`` of this model with all attached models; ValueError if it does not compile."""
         return compose.compile_model(self)
 
     def to_xml_string(self, *args: Any, precision: int = 17, **kwargs: Any) -> str:
-        """Return the composed model as MJCF; its files are called as ``get_assets`` calls them."""
+        """Return the composed model as MJCF, with the names of files in ``get_assets``."""
         del args, kwargs
         return compose.text(self, precision)
 
     def get_assets(self) -> dict[str, bytes]:
-        """Return the contents of the files that ``to_xml_string`` names: name -> bytes."""
+        """Return name -> contents of the files in ``to_xml_string``."""
         return compose.assets(self)
 
     def to_spec(self) -> MjSpec:
@@ -337,7 +338,7 @@ class RootElement(Element):
 
 
 def _merged(model: RootElement, top: RootElement) -> Iterator[tuple[Element, str, Any]]:
-    """Yield the settings that the model at the top takes over from one that is attached."""
+    """Yield the settings that the root model takes over from an attached model."""
     for section in [c for c in model._children if c.tag in SETTINGS]:
         for element in section.walk(own=True):
             target = element._in(top)
@@ -396,7 +397,7 @@ def _from_text(text: str | bytes, what: str, folder: Path, assets: dict[str, byt
 
 @functools.lru_cache(maxsize=32)
 def _document(text: str | bytes, what: str, folder: Path, resolves: bool) -> RootElement:
-    """Return the model of a document without files; worlds often have many copies of one."""
+    """Return the model of a document without files; cached, because worlds often have many copies of a model."""
     return _from_node(_parsed(text, what), folder, folder, {}, resolves)
 
 
@@ -416,7 +417,7 @@ def _from_node(
     model = RootElement(node.get("model"), str(folder) if str(folder) != "." else "", assets)
     object.__setattr__(model, "is_document", True)
     _include(node, folder, beside, assets, 0)
-    # Folders of files come first, then references, which need all elements.
+    # Set folders of files first, and references last, because they need all elements.
     for compiler in node.findall("compiler"):
         _fill(model.compiler, compiler)
         node.remove(compiler)
@@ -430,7 +431,7 @@ def _from_node(
 
 
 def _include(node: ElementTree.Element, folder: Path, beside: Path, assets: dict[str, bytes], level: int) -> None:
-    """Put the contents of included documents in their places."""
+    """Insert the contents of included documents."""
     if level > _MOST_INCLUDES:
         raise UsageError(f"{beside} has documents that include each other", hint="remove the circle")
     for number, child in reversed(list(enumerate(node))):
@@ -441,7 +442,7 @@ def _include(node: ElementTree.Element, folder: Path, beside: Path, assets: dict
         path = next((p for p in (folder / file, beside / file) if p.is_file()), None)
         if file not in assets and path is None:
             raise NoSuchFileError(
-                f"the document includes {file!r}, which is not there",
+                f"the document includes {file!r}, which does not exist",
                 hint=f"looked for {folder / file}; from_xml_string takes model_dir and assets",
             )
         part = _parsed(assets[file] if file in assets or path is None else path.read_bytes(), file)

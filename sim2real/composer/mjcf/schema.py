@@ -1,4 +1,4 @@
-"""The tags of MJCF and their attributes, as MuJoCo's own parser prints them, and what the attributes hold."""
+"""The tags of MJCF with their attributes, as printed by MuJoCo's parser, and the types of attributes."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ def _words(text: str) -> frozenset[str]:
 
 @dataclass
 class Spec:
-    """What an element with a tag may have.
+    """The attributes and children that elements with a tag may have.
 
     Attributes:
         name: The tag.
         attributes: Names in MJCF -> their places in its own table.
-        children: Tag -> what that may have.
+        children: Tag -> its specification.
         repeated: Whether there may be several in one parent.
-        implicit: Whether the element is there without being added, such as ``option`` or ``default.geom``.
-        kind: What ``find`` and ``find_all`` call it: its tag, or ``actuator``, ``sensor`` and so on; '' has no kind.
+        implicit: Whether the element exists without being added, such as ``option`` or ``default.geom``.
+        kind: Kind for ``find`` and ``find_all``: the tag, or ``actuator``, ``sensor`` and so on; '': none.
     """
 
     name: str
@@ -40,12 +40,12 @@ class Spec:
 
     @property
     def on_demand(self) -> bool:
-        """Whether there may be one in a parent, once it is added."""
+        """Whether there may be at most one in a parent, which must be added."""
         return not self.repeated and not self.implicit
 
     @functools.cached_property
     def named_by(self) -> str:
-        """The attribute that holds the name; '' where elements have no names."""
+        """The attribute with the name; '' if such elements have no names."""
         return _NAMES.get(self.name, "name" if self.kind else "")
 
 
@@ -68,14 +68,14 @@ KINDS = (
     "default",
     "attachment_frame",
 )
-"""What ``find_all`` takes."""
+"""Kinds for ``find_all``."""
 FRAME_CHILDREN = ("joint", "freejoint", "inertial")
-"""What an attachment frame may hold."""
+"""Elements that an attachment frame may have."""
 
 
 @functools.cache
 def root() -> Spec:
-    """Return what ``<mujoco>`` may have."""
+    """Return the specification of ``<mujoco>``."""
     stack: list[Spec] = []
     for line in mj.mj_printSchema(False, False).splitlines():
         entry = _ENTRY.match(line)
@@ -131,7 +131,7 @@ def _add_attributes(spec: Spec, names: list[str]) -> None:
 
 
 _FIRST = {"name": 0, "prefix": 0, "class": 1, "objtype": 2, "objname": 3, "reftype": 4, "refname": 5, "type": 6}
-"""Where PyMJCF writes some attributes."""
+"""Positions at which PyMJCF writes some attributes."""
 
 
 ARRAYS = _words(
@@ -152,7 +152,7 @@ LENGTHS = {
                      "springdamper"), 2),
     **dict.fromkeys(("solimp", "solimplimit", "solimpfriction"), 5),
 }  # fmt: skip
-"""How many numbers an attribute has at most, where that is the same for all tags."""
+"""Largest number of entries of an attribute, if it is the same for all tags."""
 INTEGER_ARRAYS = _words(
     "actuatorgroupdisable cellcount count elemtexcoord face gridsize inertiagrouprange resolution vertid "
 )
@@ -186,7 +186,7 @@ _OTHERWISE = {
 
 @functools.cache
 def form(path: str, tag: str, name: str) -> str:
-    """Return what an attribute holds: ``array``, ``ints``, ``int``, ``float`` or ``text``.
+    """Return the type of an attribute: ``array``, ``ints``, ``int``, ``float`` or ``text``.
 
     Args:
         path: Section and tag, for elements such as ``visual.map``.
@@ -214,14 +214,14 @@ _REFERENCES = {
 
 @functools.cache
 def reference(path: str, tag: str, name: str) -> str | None:
-    """Return the kind of element that an attribute names, or the attribute that says it; None where it names none."""
+    """Return the kind of element to which an attribute refers, or the attribute with the kind; None: no reference."""
     if path.startswith(("visual", "option")) or (name, tag) in (("class", "default"), ("body", "flex")):
         return None
     return _REFERENCES.get(name)
 
 
 KEYED = {"qpos": "joint", "qvel": "joint", "act": "actuator", "ctrl": "actuator", "mpos": "body", "mquat": "body"}
-"""Attribute of a keyframe -> the kind of element that its numbers belong to."""
+"""Attribute of a keyframe -> the kind of element to which its numbers belong."""
 KIND_OF_TAG = {
     "freejoint": "joint",
     **{tag: "actuator" for tag in ("general", "motor", "position", "velocity", "intvelocity", "damper", "cylinder",
@@ -234,6 +234,6 @@ SMALLER = _words("timestep tolerance ls_tolerance noslip_tolerance ccd_tolerance
 LARGER = _words(
     "iterations ls_iterations noslip_iterations ccd_iterations sdf_iterations sdf_initpoints njmax nconmax zfar memory "
 )
-"""Settings of which the larger one holds where models differ; of ``SMALLER`` the smaller one; others must be equal."""
+"""Settings of which the larger value holds if models differ; in ``SMALLER`` the smaller one; others must be equal."""
 OWN_SETTINGS = frozenset(("meshdir", "texturedir", "assetdir", "angle"))
-"""Settings of ``compiler`` that each model has for itself."""
+"""Settings of ``compiler`` that apply to each model separately."""

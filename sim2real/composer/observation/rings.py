@@ -1,4 +1,4 @@
-"""Samples of observables inside a compiled program; see ``composer.observation.schedule``."""
+"""Samples of observables in compiled programs; see ``composer.observation.schedule``."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ _NEVER = np.iinfo(np.int32).max
 
 
 class Ring:
-    """One observable, and its samples that may still be read, in arrays of a fixed size.
+    """One observable with its samples that may still be read, in arrays of fixed size.
 
     Args:
-        options: Of its schedule: physics steps from one observation to the next, and so on.
-        call: Calls the observable, given what it is and the arguments.
+        options: Options of ``Schedule``: physics steps from one observation to the next, and so on.
+        call: Calls the observable, given a label and the arguments.
 
     Raises:
-        UsageError: When a delay or an interval has no bound that a compiled program could reserve space for.
+        UsageError: A delay or an interval has no bound, so that a compiled program cannot reserve space.
 
     Attributes:
-        direct: Whether every read falls on a sample and shows nothing but it: then there is no ring at all.
+        direct: Whether every read returns the sample of the same time: then there is no ring.
     """
 
     def __init__(self, name: str, observable: Observable, options: tuple[int, bool, bool], call: Call) -> None:
@@ -96,12 +96,12 @@ class Ring:
         with physics.only_where(taken):
             value = self.sample(physics, random_state)
         new = self._insert(ring, now, value, random_state)
-        for name, value_before in before.items():  # a draw that did not happen leaves no trace
+        for name, value_before in before.items():  # a draw that did not happen must not change the state
             random_state.memory[name] = jnp.where(taken, random_state.memory[name], value_before)
         return jax.tree_util.tree_map(lambda a, b: jnp.where(due, a, b), new, ring)
 
     def _insert(self, ring: Samples, now: jax.Array, value: jax.Array, random_state: JaxRandomState) -> Samples:
-        # Selected against an index: a scatter for each copy takes several kernels on a GPU, and copies the samples.
+        # Select by comparing indices: a scatter for each copy takes several kernels on a GPU, and copies the samples.
         slot = jnp.arange(self._capacity) == ring["count"] % self._capacity
         rows = jnp.reshape(slot, (self._capacity, *(1,) * value.ndim))
         delay, interval = (
@@ -133,7 +133,7 @@ class Ring:
 
 
 def _bounds(value: object) -> tuple[int, int] | None:
-    """Return the least and the greatest value of a number or a variation of integers; None if it has no bounds."""
+    """Return the smallest and largest value of a number or an integer variation; None without bounds."""
     if not callable(value):
         return int(value), int(value)  # pyright: ignore[reportArgumentType]
     if isinstance(value, deterministic.Constant):

@@ -1,8 +1,8 @@
 """When an observable is sampled and when its samples arrive, on both engines.
 
-Time is counted in steps of the physics from the reset. The first sample is taken at 0; each next one an interval after
-the one before. A sample arrives its delay after it is taken. An observation holds the last ``buffer_size`` samples that
-have arrived, in the order of their arrival, oldest first, padded on the left.
+Time is counted in steps of the physics from the reset. The first sample is taken at 0, each further one an interval
+later. A sample arrives its delay after it is taken. An observation contains the last ``buffer_size`` samples that have
+arrived, in the order of their arrival, oldest first, padded on the left.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ DEFAULT_DELAY = 0
 
 
 class Schedule:
-    """Options of one observable, and what follows from them.
+    """Options of one observable, and derived values.
 
     Args:
         steps_per_read: Physics steps from one observation to the next.
@@ -53,15 +53,15 @@ class Schedule:
             self.delay = self.check("delay", self.delay, 0)
 
     def check(self, what: str, value: int, least: int) -> int:
-        """Return a number of steps; UsageError when it is too small."""
+        """Return a number of steps; raise UsageError if it is too small."""
         if value < least:
             raise UsageError(f"observable {self.name!r}: the {what} must be at least {least} step, got {value}")
         return int(value)
 
     def holds(self, taken: PyTree) -> PyTree:
-        """Return whether an observation can hold a sample taken at some step.
+        """Return whether an observation can contain a sample taken at some step.
 
-        Others are not taken, as in dm_control: reading one may compute the physics again, which would change other
+        Other samples are not taken, as in dm_control: a sample may compute the physics again, which would change other
         observables.
         """
         if callable(self.interval) or callable(self.delay):
@@ -71,15 +71,15 @@ class Schedule:
         return (read - arrival) // self.interval < self.size  # later samples would push it out of the buffer
 
     def shaped(self, buffer: PyTree) -> PyTree:
-        """Return what an observation shows of a buffer ``(size, ...)``."""
+        """Return the observation for a buffer ``(size, ...)``."""
         values = buffer[0] if self.strip else buffer
         return values if self.observable.aggregator is None else self.observable.aggregator(values)
 
     def spec(self, sample: specs.Array) -> specs.Array:
-        """Return shape, dtype, and bounds if there are some, of an observation.
+        """Return shape, dtype and perhaps bounds of an observation.
 
         Args:
-            sample: The same of a sample.
+            sample: Shape, dtype and perhaps bounds of a sample.
         """
         spec: PyTree = sample
         shape, aggregator = spec.shape if self.strip else (self.size, *spec.shape), self.observable.aggregator
@@ -98,7 +98,7 @@ class Schedule:
 
 
 def draw(value: Steps, random_state: RandomState) -> PyTree:
-    """Return a number of steps: a number, or what a variation or a function draws."""
+    """Return a number of steps, drawn if ``value`` is a variation or a function."""
     if isinstance(value, Variation):
         return value(random_state=random_state)
     return value() if callable(value) else value

@@ -31,7 +31,7 @@ class _Channel:
     """One enabled observable, and its samples that may still be read: arrival, number, value.
 
     Args:
-        options: Of its schedule: physics steps from one observation to the next, and so on.
+        options: Options of ``Schedule``: physics steps from one observation to the next, and so on.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class _Channel:
             self.due = now + schedule.check("update interval", draw(schedule.interval, self._random_state), 1)
 
     def _gap(self, now: int) -> int:
-        """Return how many steps later the next sample is taken that an observation holds."""
+        """Return the number of steps until the next sample that an observation can contain."""
         phase = now % self.schedule.steps_per_read
         if phase not in self._gaps:
             interval: PyTree = self.schedule.interval
@@ -97,7 +97,7 @@ class _Channel:
         return np.asarray(schedule.shaped(buffer))
 
     def _arrived(self, now: int) -> list[tuple[int, int, np.ndarray]]:
-        """Return the samples that an observation holds now, in the order of their arrival; forget those before."""
+        """Return the samples of an observation now, in the order of their arrival; drop older ones."""
         samples = self._samples
         if not self.schedule.is_regular:
             samples.sort(key=_order)
@@ -109,16 +109,16 @@ class _Channel:
 
 
 class Updater:
-    """Samples, delays and buffers the enabled ones of some observables.
+    """Samples, delays and buffers observables that are enabled.
 
     Args:
-        observables: Name -> observable, or a list or tuple of such dictionaries; observations have that structure.
+        observables: Name -> observable, or a list or tuple of such dictionaries; observations have the same structure.
         physics_steps_per_control_step: How often ``update`` is called between reads.
-        strip_singleton_buffer_dim: Leave the first axis out where the buffer holds one sample.
-        pad_with_initial_value: Pad with the first sample rather than with zeros.
+        strip_singleton_buffer_dim: Whether to leave out the first axis of observations with one sample.
+        pad_with_initial_value: Whether to pad with the first sample instead of zeros.
 
     Raises:
-        UsageError: When ``observables`` has another structure.
+        UsageError: ``observables`` has another structure.
     """
 
     def __init__(

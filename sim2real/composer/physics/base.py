@@ -28,8 +28,8 @@ class BasePhysics(ABC):
         model: The attributes of an ``MjModel``; ``ptr`` is the compiled model itself.
         data: The attributes of an ``MjData``.
         named: Model and data, with rows by name.
-        variables: Name -> array: a task's own values from hook to hook in an episode. ``reset`` empties it.
-        legacy_step: After a step, also compute positions and velocities of the new state, as dm_control does.
+        variables: Name -> array: values that a task stores between hooks of an episode. ``reset`` empties it.
+        legacy_step: Whether to compute positions and velocities of the new state after a step, as in dm_control.
     """
 
     np: ClassVar[ArrayModule]
@@ -92,7 +92,7 @@ class BasePhysics(ABC):
             setattr(self.data, name, part)
 
     def check_keyframe(self, keyframe_id: int) -> None:
-        """Check that a keyframe exists; UsageError when there is no such keyframe."""
+        """Raise UsageError if there is no such keyframe."""
         count = self.model.ptr.nkey
         if not 0 <= keyframe_id < count:
             raise UsageError(f"`keyframe_id` must be between 0 and {count - 1} inclusive, got: {keyframe_id}")
@@ -111,7 +111,7 @@ class BasePhysics(ABC):
 
     @abstractmethod
     def mark_as_dirty(self) -> None:
-        """Compute all quantities again before a binding reads a computed one."""
+        """Let all quantities be computed again before a binding reads a derived one."""
 
     @abstractmethod
     def recompute_constants(self) -> None:
@@ -119,7 +119,7 @@ class BasePhysics(ABC):
 
     @abstractmethod
     def fail(self, condition: ArrayLike = True) -> None:
-        """Reject this initial state where the condition holds."""
+        """Reject this initial state where the condition is true."""
 
     @abstractmethod
     def suppress_physics_errors(self) -> AbstractContextManager[None]:
@@ -129,7 +129,7 @@ class BasePhysics(ABC):
         """Return the attributes of an element, or of several of one kind.
 
         Raises:
-            UsageError: When something is no element, is of another kind than the rest, or is not in the compiled model.
+            UsageError: Something is no element, is of another kind than the rest, or is not in the compiled model.
         """
         sequence, single = as_elements(elements)
         if not sequence:
@@ -141,7 +141,7 @@ class BasePhysics(ABC):
 
     @abstractmethod
     def _new_binding(self, kind: str, ids: tuple[int, ...], single: bool) -> BaseBinding:
-        """Return the attributes of elements with some numbers."""
+        """Return a binding of the elements with these numbers."""
 
     def get(self, elements: Elements, name: str) -> PyTree:
         """Return an attribute of elements."""
@@ -182,16 +182,16 @@ class NativeView:
 
 
 class BaseModelView(NativeView):
-    """``physics.model``: the attributes of an ``MjModel``, and names to numbers and back."""
+    """``physics.model``: the attributes of an ``MjModel``, and conversions between names and numbers."""
 
     __slots__ = ()
 
     def name2id(self, name: str, kind: str | int) -> int:
-        """Return the number of the element of a kind, or ``mjtObj``, with a name; UsageError when there is none."""
+        """Return the number of a named element of a kind, or ``mjtObj``; raise UsageError if there is none."""
         return layout.resolve(self.ptr, _kind(kind), (name,))[0]
 
     def id2name(self, number: int, kind: str | int) -> str:
-        """Return the name of an element of a kind, or ``mjtObj``; '' when it has none."""
+        """Return the name of an element of a kind, or ``mjtObj``; '' if it has none."""
         return mj.mj_id2name(self.ptr, layout.OBJECT_TYPES[_kind(kind)], number) or ""
 
 
@@ -233,7 +233,7 @@ class BaseBinding(ABC):
             object.__setattr__(self, name, value)
 
     def locate(self, name: str) -> tuple[layout.Field, Index]:
-        """Return the field that holds an attribute and the index of the bound rows in it."""
+        """Return the field with an attribute, and the index of the bound rows in it."""
         field = self._fields.get(name)
         if field is None:
             available = ", ".join(sorted(self._fields))
@@ -268,7 +268,7 @@ class BaseBinding(ABC):
         self.write(name, value)
 
     def _plain(self, array: PyTree) -> Array:
-        """Return an array whose parts are not bound to the elements."""
+        """Return an array that is not bound to the elements."""
         return array
 
     def __dir__(self) -> list[str]:
@@ -294,7 +294,7 @@ class EmptyBinding:
 
 
 def updated(xp: ArrayModule, array: PyTree, index: Index, value: ArrayLike) -> Array:
-    """Return a copy of an array with another value in a part of it."""
+    """Return a copy of an array with another value at an index."""
     if xp is not np:
         array = xp.asarray(array)
         return array.at[index].set(xp.asarray(value, array.dtype))

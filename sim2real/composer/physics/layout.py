@@ -1,4 +1,4 @@
-"""Where the attributes of an element lie in MuJoCo's arrays; the same indices serve both engines."""
+"""Indices of the attributes of elements in MuJoCo's arrays, for both engines."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from sim2real.composer.types import Index, MjModel
 
 TRIGGERS = {"qpos", "qvel", "act", "ctrl", "qfrc_applied", "xfrc_applied", "mocap_pos", "mocap_quat", "eq_active"}
-"""Fields of the data whose change makes everything computed from them out of date."""
+"""Fields of the data from which other quantities are computed."""
 _COSMETIC = ("rgba", "matid", "emission", "specular", "shininess", "reflectance", "needstage", "user", "group")
 
 DISABLED_BY = {
@@ -31,7 +31,7 @@ DISABLED_BY = {
     "body_ipos": ("body_simple", "body_sameframe"),
     "body_iquat": ("body_simple", "body_sameframe"),
 }
-"""Shortcuts of MuJoCo's that must be switched off when a field is written: they would hide the new value."""
+"""MuJoCo's shortcuts that must be switched off when a field is written, because they would ignore the new value."""
 
 
 COLUMNS = {
@@ -59,7 +59,7 @@ def columns(key: Index) -> Index:
 
 @dataclass(frozen=True)
 class ElementKind:
-    """How elements of a kind are stored: object type, first dimensions of their fields, prefixes of field names."""
+    """Storage of elements of a kind: object type, first dimensions of fields, prefixes of field names."""
 
     object_type: int
     sizes: tuple[str, ...]
@@ -149,7 +149,7 @@ def _range(model: MjModel, size: str, number: int) -> range:
 
 
 def index(model: MjModel, field: Field, ids: tuple[int, ...], single: bool) -> Any:
-    """Return what indexes the rows of a field: an int, a slice, or an int array of shape ``(n,)``.
+    """Return the index of the rows of a field: an int, a slice, or an int array of shape ``(n,)``.
 
     Args:
         single: Whether one element was bound, rather than a sequence of them.
@@ -174,13 +174,13 @@ def resolve(model: MjModel, kind: str, names: tuple[str, ...]) -> tuple[int, ...
         available = names_of(model, kind)
         raise UsageError(
             f"the compiled model has no {kind} {names[numbers.index(-1)]!r}. Available: {', '.join(available)}",
-            hint="an element added after the model was compiled is there after the next compilation",
+            hint="elements that were added after the compilation exist only after the next one",
         )
     return numbers
 
 
 def names_of(model: MjModel, kind: str) -> list[str]:
-    """Return the names of all elements of a kind in a compiled model, '' for those without one."""
+    """Return the names of all elements of a kind in a compiled model, '' for elements without a name."""
     object_type = OBJECT_TYPES[kind]
     count = {"camera": "ncam", "joint": "njnt", "material": "nmat", "texture": "ntex", "equality": "neq"}.get(kind)
     count = count or {"actuator": "nactuator"}.get(kind) or f"n{kind}"

@@ -25,14 +25,14 @@ _KIND_OF_SIZE = {size: name for name, kind in layout.KINDS.items() for size in k
 
 
 class NamedArray(NDArrayOperatorsMixin):
-    """One array whose rows are indexed by numbers, names or elements; otherwise it is that array.
+    """An array whose rows can also be indexed by names or elements.
 
-    A list of rows beside a list of columns gives pairs, as in numpy; ``np.ix_`` gives all combinations.
+    A list of rows with a list of columns gives pairs, as in numpy; ``np.ix_`` gives all combinations.
 
-    A name that is not there may leave out the models it is attached below, as long as only one element ends with it.
+    The models before a name may be left out, if only one element's name ends with it.
 
     Args:
-        holder: What has the array as an attribute: the model or the data.
+        holder: The model or the data that has the array as an attribute.
     """
 
     def __init__(self, model: MjModel, field: layout.Field, holder: object) -> None:
@@ -82,7 +82,7 @@ class NamedArray(NDArrayOperatorsMixin):
         """Return the numeric index for a key of names, elements or numbers.
 
         Raises:
-            KeyError: When no element, or more than one, is called so.
+            KeyError: No element, or more than one, has the name.
         """
         if isinstance(key, tuple):
             row, *columns = key
@@ -92,7 +92,7 @@ class NamedArray(NDArrayOperatorsMixin):
     def _rows(self, key: Index) -> Index:
         if isinstance(key, str | Element):
             return layout.index(self._model, self._field, (self._number(key),), True)
-        if isinstance(key, np.ndarray) and key.dtype.kind == "U":  # as np.ix_ makes them from names
+        if isinstance(key, np.ndarray) and key.dtype.kind == "U":  # arrays of names from np.ix_
             return np.reshape(self._rows(key.ravel().tolist()), key.shape)
         if isinstance(key, Iterable) and not isinstance(key, np.ndarray):
             keys = list(key)

@@ -135,7 +135,7 @@ class ContextVariation(Variation):
 
 
 class Parametric(ContextVariation):
-    """A variation that is equal to another one of its class with equal parameters."""
+    """A variation that equals another one if classes and parameters are equal."""
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, type(self)) and [*vars(self).values()] == [*vars(other).values()]

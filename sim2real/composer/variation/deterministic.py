@@ -35,7 +35,7 @@ class Constant(Parametric):
 
 
 class Sequence(ContextVariation):
-    """One value after the other, and the first one after the last; on MJX: of numbers or arrays of one shape."""
+    """One value after the other, cyclically; on MJX, numbers or arrays of one shape."""
 
     def __init__(self, values: Iterable[Varying]) -> None:
         self._values = values

@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 
 
 class Distribution(Parametric):
-    """A distribution whose parameters may vary themselves; they can be read as attributes.
+    """A distribution whose parameters may be variations; parameters can be read as attributes.
 
     Args:
-        single_sample: Draw one sample for an initial value of any shape.
+        single_sample: Whether to draw one sample for an initial value of any shape.
     """
 
     def __init__(self, *args: Varying, single_sample: bool = False, **kwargs: Varying) -> None:
@@ -34,7 +34,7 @@ class Distribution(Parametric):
 
     @property
     def parameters(self) -> tuple[PyTree, ...]:
-        """The parameters, those without a name first."""
+        """The parameters, positional ones first."""
         return (*self._args, *self._kwargs.values())
 
     def __getattr__(self, name: str) -> PyTree:
@@ -139,13 +139,13 @@ class Bernoulli(Distribution):
 
 
 class BiasedRandomWalk(ContextVariation):
-    """A zero-mean Ornstein-Uhlenbeck process, one step a call; it continues in the next episode, except on MJX.
+    """A zero-mean Ornstein-Uhlenbeck process, one step per call; it continues in the next episode, except on MJX.
 
     Args:
-        timescale: Calls after which the correlation has fallen to 1/e; 0: uncorrelated.
+        timescale: Number of calls after which the correlation has fallen to 1/e; 0: uncorrelated.
 
     Raises:
-        UsageError: When one of them is negative.
+        UsageError: An argument is negative.
     """
 
     def __init__(self, stdev: float = 0.1, timescale: float = 10.0) -> None:

@@ -1,4 +1,4 @@
-"""Noise on top of a value."""
+"""Noise that is added to, or multiplied with, a value."""
 
 from __future__ import annotations
 

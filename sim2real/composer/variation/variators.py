@@ -19,7 +19,7 @@ E = TypeVar("E")
 CONSTANTS = frozenset(
     {"mass", "inertia", "ipos", "iquat", "pos", "quat", "armature", "qpos0", "qpos_spring", "gear", "stiffness", "size"}
 )
-"""Attributes that MuJoCo computes constants from, such as the inertia seen at a joint."""
+"""Attributes from which MuJoCo derives constants, such as the inertia at a joint."""
 
 
 class _Bound:
@@ -55,7 +55,7 @@ class _Variator(Generic[E]):
                 bound.initial = None
 
     def _initial(self, element: E, name: str) -> PyTree:
-        """Return the value of an attribute when it is bound; None: that at the next application."""
+        """Return the value of an attribute when it is bound; None: the value at the next application."""
         del element, name
 
 
@@ -80,8 +80,8 @@ class MJCFVariator(_Variator["Element"]):
 class PhysicsVariator(_Variator["Elements"]):
     """Varies attributes of the compiled model and of the state; for ``initialize_episode`` and the steps.
 
-    On MJX the initial value is that of the compiled model, and only numeric fields of the model can vary from copy to
-    copy. Constants that MuJoCo derives from masses and lengths follow.
+    On MJX the initial value is the compiled model's, and only numeric fields of the model can vary from copy to copy.
+    Constants that MuJoCo derives from masses and lengths are updated.
     """
 
     def apply_variations(self, physics: PyTree, random_state: RandomState) -> None:

@@ -1,4 +1,4 @@
-"""The kinds of observables, under the name that dm_control's documents import them by."""
+"""The kinds of observables, in the module from which dm_control's documents import them."""
 
 from sim2real.composer.observation.observable.base import AGGREGATORS as AGGREGATORS
 from sim2real.composer.observation.observable.base import Generic as Generic

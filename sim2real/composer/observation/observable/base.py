@@ -1,4 +1,4 @@
-"""What can be observed: functions of the physics, attributes of elements, arrays by name, images of cameras."""
+"""Observables: functions of the physics, attributes of elements, arrays by name, images of cameras."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ class Aggregator:
         self.name, self.preserves_bounds = name, preserves_bounds
 
     def __call__(self, values: Array) -> Array:
-        """Return the reduced values; a number without an axis stays as it is."""
-        if np.ndim(values) == 0:  # as numpy does, and jax.numpy does not
+        """Return the reduced values; a number stays as it is."""
+        if np.ndim(values) == 0:  # numpy accepts lists, jax.numpy does not
             return values
         return getattr(namespace(values), self.name)(values, axis=0)
 
@@ -61,15 +61,15 @@ class Observable(ABC):
 
     Args:
         update_interval: Time steps of the physics between samples: a number, a variation or a callable; default 1.
-        buffer_size: How many of the last samples an observation holds; default 1.
+        buffer_size: How many of the last samples an observation contains; default 1.
         delay: Time steps between sampling and arrival: a number, a variation or a callable; default 0.
         aggregator: Reduces the buffer: ``min``, ``max``, ``mean``, ``median``, ``sum`` or a callable.
         corruptor: Called as ``corruptor(value, random_state=...)`` on every sample; may be a variation.
 
     Attributes:
         enabled: Whether it is part of the observation; False at first.
-        max_delay: Bound of a delay that varies; compiled programs need it where the variation has none of its own.
-        min_interval: Bound of an interval that varies; the same.
+        max_delay: Upper bound of a varying delay; compiled programs need it if the variation has no bound.
+        min_interval: Lower bound of a varying interval, needed likewise.
     """
 
     def __init__(
@@ -121,7 +121,7 @@ class Observable(ABC):
         return self.observation_callable(physics, random_state)()
 
     def configure(self, **options: PyTree) -> None:
-        """Set several attributes; AttributeError when there is none of a name."""
+        """Set several attributes; raise AttributeError if one does not exist."""
         for name, value in options.items():
             if not hasattr(self, name):
                 raise AttributeError(f"Cannot add attribute {name} in configure.")
@@ -132,7 +132,7 @@ class Generic(Observable):
     """A function of the physics; see ``Observable`` for the options of samples.
 
     Args:
-        raw_observation_callable: Takes the physics, returns a number or an array.
+        raw_observation_callable: Function of the physics that returns a number or an array.
     """
 
     def __init__(
@@ -182,10 +182,10 @@ class MJCFFeature(Observable):
     ``feature[index]`` observes a part of it.
 
     Args:
-        kind: The attribute as ``physics.bind`` names it, such as ``qpos`` or ``xpos``.
+        kind: The attribute's name in ``physics.bind``, such as ``qpos`` or ``xpos``.
 
     Raises:
-        UsageError: When something given is no element.
+        UsageError: Something is no element.
     """
 
     def __init__(
@@ -199,7 +199,7 @@ class MJCFFeature(Observable):
         corruptor: Corrupt | None = None,
         index: PyTree = None,
     ) -> None:
-        as_elements(mjcf_element)  # refuses what is none
+        as_elements(mjcf_element)  # raises an error for anything else
         self._kind, self._element, self._index = kind, mjcf_element, index
         super().__init__(update_interval, buffer_size, delay, aggregator, corruptor)
 
@@ -267,7 +267,7 @@ class MJCFCamera(MujocoCamera):
         render_flag_overrides: See ``Physics.render``.
 
     Raises:
-        UsageError: When the element is no camera, or depth and segmentation are both asked for.
+        UsageError: The element is no camera, or both depth and segmentation are requested.
     """
 
     def __init__(

@@ -1,1 +1,1 @@
-"""The C engine: a compiled model and its state in MuJoCo itself, bound elements and images. Machinery."""
+"""The C engine: a compiled model and its state in MuJoCo, bound elements and images."""

@@ -52,7 +52,7 @@ class ModelView(BaseModelView):
 class Images:
     """Draws a model by ``mujoco.Renderer``: one for each thread and size, as OpenGL's contexts belong to threads.
 
-    Textures and height fields are those that it had when a thread drew its first image of a size.
+    Later changes of textures and height fields are not drawn.
     """
 
     def __init__(self, model: MjModel) -> None:
@@ -107,7 +107,7 @@ class Images:
             renderer.scene.flags[:] = before
 
     def close(self) -> None:
-        """Free the renderers of this thread, and let go of those of others."""
+        """Free the renderers of this thread, and drop references to those of other threads."""
         for (thread, *_), renderer in self._renderers.items():
             if thread == threading.get_ident():
                 renderer.close()
@@ -122,9 +122,9 @@ def _flag(name: str | int) -> int:
 
 
 class Staleness:
-    """Whether a physics was written to since all quantities were last computed.
+    """Whether a physics was changed after its derived quantities were last computed.
 
-    A separate object, as every read of a bound attribute looks it up.
+    A separate object, because every read of a bound attribute looks it up.
     """
 
     __slots__ = ("dirty",)
@@ -199,7 +199,7 @@ class Physics(BasePhysics):
         return array.copy()
 
     def get_state(self, sig: int | None = None) -> np.ndarray:
-        """Return positions, velocities and activations, shape ``(nq + nv + na,)``; or the result of ``mj_getState``."""
+        """Return positions, velocities and activations, shape ``(nq + nv + na,)``; with ``sig``, ``mj_getState``."""
         if sig is None:
             return np.asarray(super().get_state())
         state = np.empty(mj.mj_stateSize(self.model.ptr, sig))
@@ -209,14 +209,14 @@ class Physics(BasePhysics):
     state = get_state
 
     def set_state(self, state: ArrayLike, sig: int | None = None) -> None:
-        """Set the result of ``get_state``; UsageError when the shape is another."""
+        """Set the result of ``get_state``; raise UsageError for another shape."""
         if sig is None:
             super().set_state(state)
         else:
             mj.mj_setState(self.model.ptr, self.data.ptr, np.asarray(state, float), sig)
 
     def copy(self, share_model: bool = False) -> Physics:
-        """Return an independent copy of the state, and of the model unless it is to be shared."""
+        """Return an independent copy of the state, and of the model unless ``share_model``."""
         physics = object.__new__(type(self))
         physics.legacy_step, physics.variables, physics._suppress = self.legacy_step, dict(self.variables), False
         model = self.model.ptr if share_model else mj.MjModel.__copy__(self.model.ptr)
@@ -232,7 +232,7 @@ class Physics(BasePhysics):
     # -- dynamics
 
     def step(self, nstep: int = 1) -> None:
-        """Advance by a number of time steps; PhysicsError when MuJoCo warns."""
+        """Advance by a number of time steps; raise PhysicsError if MuJoCo warns."""
         model, data = self.model.ptr, self.data.ptr
         self._warned = self._warnings.tobytes()
         if not self.legacy_step:
@@ -240,7 +240,7 @@ class Physics(BasePhysics):
         elif model.opt.integrator == _RK4:
             mj.mj_step(model, data, nstep)
             mj.mj_step1(model, data)
-        else:  # positions and velocities are those of this state already: finish the step, then prepare the next
+        else:  # positions and velocities are computed for this state already: finish the step, then prepare the next
             mj.mj_step2(model, data)
             if nstep > 1:
                 mj.mj_step(model, data, nstep - 1)
@@ -264,13 +264,13 @@ class Physics(BasePhysics):
         self.after_reset()
 
     def after_reset(self) -> None:
-        """Compute everything without the actuators: there are no controls yet."""
+        """Compute all quantities without the actuators, because there are no controls yet."""
         with self.model.disable("actuation"):
             self.forward()
 
     @contextlib.contextmanager
     def reset_context(self) -> Iterator[Physics]:
-        """Reset, let the block set the initial state, then compute everything that follows from it."""
+        """Reset, let the block set the initial state, then compute all derived quantities."""
         with contextlib.suppress(PhysicsError):
             self.reset()
         yield self
@@ -298,7 +298,7 @@ class Physics(BasePhysics):
 
     @property
     def is_dirty(self) -> bool:
-        """Whether something was written through a binding since everything was last computed."""
+        """Whether something was written through a binding after all quantities were last computed."""
         return self.staleness.dirty
 
     def mark_as_dirty(self) -> None:
@@ -307,7 +307,7 @@ class Physics(BasePhysics):
     def bind(self, elements: Elements) -> PyTree:
         """Return the attributes of an element, or of several of one kind; see ``BasePhysics.bind``.
 
-        Bindings are cached: they have the places of the attributes in MuJoCo's arrays.
+        Bindings are cached: they know the indices of the attributes in MuJoCo's arrays.
         """
         key: Any = tuple(elements) if isinstance(elements, list) else elements
         try:
@@ -327,13 +327,13 @@ class Physics(BasePhysics):
             raise EpisodeInitializationError
 
     def recompute_constants(self) -> None:
-        mj.mj_setConst(self.model.ptr, mj.MjData(self.model.ptr))  # this state would be left as at the reference
+        mj.mj_setConst(self.model.ptr, mj.MjData(self.model.ptr))  # mj_setConst would leave this state at the reference
         self.mark_as_dirty()
 
     def count_compensated(self) -> None:
-        """Have MuJoCo see that bodies are compensated for gravity, where none was when the model was compiled."""
+        """Switch gravity compensation on in MuJoCo, if no body had any when the model was compiled."""
         model, before = self.model.ptr, copy.copy(self.model.ptr)
-        mj.mj_setConst(model, mj.MjData(model))  # the only function that sets the number of such bodies
+        mj.mj_setConst(model, mj.MjData(model))  # the only function that sets the number of compensated bodies
         for name, value in ((n, getattr(before, n)) for n in dir(before)):
             if isinstance(value, np.ndarray) and value.flags.writeable:
                 getattr(model, name)[...] = value
@@ -355,8 +355,8 @@ class Physics(BasePhysics):
         """Return an image: uint8 ``(height, width, 3)``; float32 ``(height, width)`` [m]; int32 ``(.., .., 2)``.
 
         Args:
-            height: Of the image [pixels].
-            width: Of the image [pixels].
+            height: Height of the image [pixels].
+            width: Width of the image [pixels].
             camera_id: Number or name of one of the model's cameras; -1 is the free camera.
             segmentation: Return numbers and types (``mjtObj``) of objects instead; (-1, -1) is none.
             scene_option: The ``MjvOption`` of the image.
@@ -369,7 +369,7 @@ class Physics(BasePhysics):
 
     @property
     def contexts(self) -> None:
-        """None: there is no rendering context that the caller updates."""
+        """None: callers need not update rendering contexts."""
         return
 
     def free(self) -> None:
@@ -393,9 +393,9 @@ class Place:
     """The place of an attribute of bound elements.
 
     Attributes:
-        index: The rows in it.
-        derived: Whether it is computed from other attributes, and out of date once those are written.
-        shown: The array that readers get; None where they get a number.
+        index: Its rows in the field.
+        derived: Whether it is computed from other attributes, and out of date when they change.
+        shown: The array that readers get; None if they get a number.
         plain: The memory of ``shown`` as a plain array.
     """
 
@@ -412,12 +412,13 @@ class Place:
 
 
 class SyncedArray(np.ndarray):
-    """A part of a MuJoCo array: writing an item writes it there too, and marks computed quantities.
+    """A copy of a part of a MuJoCo array: writing an item also writes to MuJoCo, and marks derived quantities.
 
-    Reading it again through its binding brings the newest values.
+    Reading it again through its binding gives the newest values.
     """
 
-    _binding: Binding | None = None  # parts of this array do not take these over: they write to nothing
+    # Slices of this array do not inherit these: writing to a slice has no effect on MuJoCo.
+    _binding: Binding | None = None
     _name: str = ""
 
     def __array_wrap__(
@@ -431,8 +432,8 @@ class SyncedArray(np.ndarray):
         if binding is None:
             super().__setitem__(key, value)
             return
-        value = np.array(value)  # it may be a part of this array: `array[1:] *= 2` changes that before it comes here
-        getattr(binding, self._name)  # which brings the newest values here
+        value = np.array(value)  # the value may be a slice of this array: `array[1:] *= 2` changes it before this call
+        getattr(binding, self._name)  # this updates the values here
         super().__setitem__(key, value)
         binding.write(self._name, np.asarray(self))
 

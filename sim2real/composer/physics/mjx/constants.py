@@ -1,4 +1,4 @@
-"""Constants that MuJoCo derives from a model at its reference position, computed inside a program (``mj_setConst``)."""
+"""Computes the constants that MuJoCo derives from a model (``mj_setConst``) inside a program."""
 
 from __future__ import annotations
 
@@ -25,17 +25,15 @@ _WIDTHS = {
     int(mj.mjtJoint.mjJNT_SLIDE): (1,),
     int(mj.mjtJoint.mjJNT_HINGE): (1,),
 }
-"""Degrees of freedom of a joint, in groups that share one mean inverse inertia."""
+"""Sizes of groups of a joint's degrees of freedom that share a mean inverse inertia."""
 _ONLY_SLIDES = 2
 """``body_simple`` of bodies that only slide along axes of the world; MuJoCo takes their mass for their inertia."""
 _IS_DERIVED = 11
-"""Where the data of a weld say whether its pose is that at the reference position."""
+"""Indices of a weld's data that tell whether its pose is the one at the reference position."""
 
 
 def derived(host: MjModel, model: mjx.Model) -> frozenset[str]:
-    """Return the names of the fields that ``derive`` computes.
-
-    Without a trace of it, which takes seconds.
+    """Return the names of the fields that ``derive`` computes, without tracing it, which takes seconds.
 
     Raises:
         UsageError: As ``derive`` does.
@@ -75,19 +73,19 @@ def derive(host: MjModel, model: mjx.Model) -> dict[str, jax.Array]:
 
 @jax.jit
 def _at_reference(model: mjx.Model, data: PyTree) -> mjx.Data:
-    """Return what follows from the reference position; traced once for all programs with a model of this form."""
+    """Return the data at the reference position; traced once for all programs with a model of this form."""
     with held_links():
         data = mjx.com_pos(model, mjx.kinematics(model, data.replace(qpos=model.qpos0)))
     return mjx.transmission(model, mjx.crb(model, mjx.tendon(model, mjx.camlight(model, data))))
 
 
 def _twin(host: MjModel, model: mjx.Model) -> mjx.Model:
-    """Return a model of Warp as one of MJX's JAX, which computes constants from fields that both have."""
+    """Convert a model of Warp to one of MJX in JAX, which computes the constants."""
     try:
         twin: PyTree = mjx.put_model(host, impl="jax")
     except NotImplementedError as error:
         raise UsageError(
-            f"MJX-Warp computes what follows from masses and lengths with MJX's JAX, which cannot: {error}",
+            f"MJX in JAX computes constants of masses and lengths, and refuses this model: {error}",
             hint="set them in initialize_episode_mjcf",
         ) from error
     names = [name for name in twin.__dataclass_fields__ if varies(name)]
@@ -103,7 +101,7 @@ def _subtree_masses(host: MjModel, model: mjx.Model) -> jax.Array:
 
 
 def _inverse_weights(host: MjModel, model: mjx.Model, data: mjx.Data) -> dict[str, jax.Array]:
-    """Return the inverse inertias that constraints see of bodies, degrees of freedom and tendons; ``(A M^-1 A^T)``."""
+    """Return the inverse inertias of bodies, degrees of freedom and tendons for constraints: ``A M^-1 A^T``."""
     impl: PyTree = data._impl
     # Invert the matrix of inertia.
     M, J = _inertia_and_jacobians(model, data)
@@ -118,7 +116,7 @@ def _inverse_weights(host: MjModel, model: mjx.Model, data: mjx.Data) -> dict[st
             dofs += [jnp.mean(diagonal[start : start + width])] * width
     spatial = jnp.einsum("bvi,vw,bwi->bi", J, inverse, J)
     weights = jnp.where((host.body_weldid != 0)[:, None], spatial.reshape(-1, 2, 3).mean(axis=-1), 0.0)
-    # Bodies that only slide have their mass in the place of the inertia.
+    # For bodies that only slide, the mass replaces the inertia.
     simple, mass = np.asarray(host.body_simple) == _ONLY_SLIDES, jnp.maximum(model.body_mass, mj.mjMINVAL)
     constants = {
         "dof_M0": jnp.diag(M),
@@ -141,7 +139,7 @@ def _inertia_and_jacobians(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array,
 
 
 def _radii(host: MjModel, model: mjx.Model) -> jax.Array:
-    """Return the radii of spheres around the geoms; geoms without a size of their own, such as meshes, keep theirs."""
+    """Return the radii of spheres around the geoms; for geoms such as meshes, the compiled radius."""
     size, kind, types = model.geom_size, np.asarray(host.geom_type), mj.mjtGeom
     radii = {
         types.mjGEOM_SPHERE: size[:, 0],
@@ -157,7 +155,7 @@ def _radii(host: MjModel, model: mjx.Model) -> jax.Array:
 
 
 def _boxes(host: MjModel, model: mjx.Model) -> jax.Array:
-    """Return centres and half sizes of boxes around the geoms, shape ``(ngeom, 2, 3)``, which Warp looks at first."""
+    """Return centres and half sizes of boxes around the geoms, shape ``(ngeom, 2, 3)``, for Warp's first test."""
     x, y, z = model.geom_size.T
     kind, types = np.asarray(host.geom_type)[:, None], mj.mjtGeom
     halves = {
@@ -174,7 +172,7 @@ def _boxes(host: MjModel, model: mjx.Model) -> jax.Array:
 
 
 def _derived_equalities(host: MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Return which equalities connect, and which weld, bodies at the reference position, bool."""
+    """Return masks of the connects, and of the welds, that take their poses from the reference position."""
     bodies = np.asarray(host.eq_objtype) == int(mj.mjtObj.mjOBJ_BODY)
     connects = bodies & (np.asarray(host.eq_type) == int(mj.mjtEq.mjEQ_CONNECT))
     welds = bodies & (np.asarray(host.eq_type) == int(mj.mjtEq.mjEQ_WELD))
@@ -182,7 +180,7 @@ def _derived_equalities(host: MjModel) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _equalities(host: MjModel, model: mjx.Model, data: mjx.Data) -> jax.Array:
-    """Return the data of equalities, with anchors and poses of bodies as they are at the reference position."""
+    """Return the data of equalities, with anchors and poses of bodies at the reference position."""
     connects, welds = (jnp.asarray(rows)[:, None] for rows in _derived_equalities(host))
     anchor, one, two = model.eq_data[:, :3], host.eq_obj1id, host.eq_obj2id
 

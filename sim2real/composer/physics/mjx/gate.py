@@ -1,4 +1,4 @@
-"""What MJX would ignore or compute otherwise, refused by name before anything is compiled."""
+"""Refuses, before anything is compiled, what MJX would ignore or compute differently."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _PASSIVE = (mj.mjtDisableBit.mjDSBL_SPRING, mj.mjtDisableBit.mjDSBL_DAMPER)
 
 
 def check_model(model: MjModel) -> None:
-    """Refuse a compiled model that MJX does not simulate as MuJoCo does; UsageError with the option or the elements."""
+    """Refuse a compiled model that MJX would simulate differently; UsageError with the option or the elements."""
     if int(model.opt.noslip_iterations) > 0:
         raise UsageError(
             f"MJX has no no-slip solver: option noslip_iterations is {model.opt.noslip_iterations}",
@@ -27,7 +27,7 @@ def check_model(model: MjModel) -> None:
     passive = [int(model.opt.disableflags) & int(flag) != 0 for flag in _PASSIVE]
     if any(passive) and not all(passive):
         raise UsageError(
-            "MJX leaves out springs and dampers where only one of them is disabled",
+            "MJX leaves out both springs and dampers if one of them is disabled",
             hint="disable both, or neither and set stiffness or damping to 0",
         )
     # MJX has no history of controls and sensor data.
@@ -38,7 +38,7 @@ def check_model(model: MjModel) -> None:
         if late:
             raise UsageError(
                 f"MJX ignores MuJoCo's own delays and intervals: {kind} {', '.join(map(repr, late))}",
-                hint="take delay, nsample and interval out of the MJCF; delay the observable or the connection instead",
+                hint="remove delay, nsample and interval from the MJCF; delay the observable or the connection instead",
             )
     if model.opt.integrator not in _INTEGRATORS:
         raise UsageError(
@@ -48,9 +48,9 @@ def check_model(model: MjModel) -> None:
 
 
 def settle_cone(model: MjModel) -> None:
-    """Make friction cones pyramidal in models without contacts, where they have no effect; refuse those that MJX lacks.
+    """Make friction cones pyramidal in models without contacts; refuse cones that MJX lacks.
 
-    With elliptic ones, which arenas have, MJX 3.17 fails on models that have constraints but no contact.
+    With elliptic cones, the default of arenas, MJX 3.17 fails on models that have constraints but no contacts.
     """
     if model.opt.cone != mj.mjtCone.mjCONE_ELLIPTIC:
         return
@@ -62,7 +62,7 @@ def settle_cone(model: MjModel) -> None:
         smooth = (model.geom_condim == 1) & ((model.geom_contype | model.geom_conaffinity) != 0)
         names = [mj.mj_id2name(model, mj.mjtObj.mjOBJ_GEOM, i) for i in smooth.nonzero()[0]]
         raise UsageError(
-            f"MJX has no contacts of condim 1 beside elliptic friction cones: geoms {', '.join(map(repr, names))}",
+            f"MJX has no contacts of condim 1 with elliptic friction cones: geoms {', '.join(map(repr, names))}",
             hint='give them condim 3, or set option cone to "pyramidal"',
         )
     model.opt.cone = mj.mjtCone.mjCONE_ELLIPTIC

@@ -25,10 +25,10 @@ _tracing = threading.RLock()
 
 @contextlib.contextmanager
 def held_links() -> Iterator[None]:
-    """Have MJX's walks along the tree of bodies end a fusion of XLA's at each link, for what is traced in the block.
+    """Let code that is traced in the block end XLA's fusion at each link of a chain of bodies.
 
-    On a CPU XLA fuses the whole chain, and computes each link's pose at each use: twice as often with every link. Code
-    that calls MJX elsewhere is not affected; one thread at a time traces such a block.
+    On a CPU, XLA would fuse the whole chain, and compute each link's pose at each use: twice as often with every link.
+    Other code that calls MJX is not affected; only one thread at a time traces such a block.
     """
     with _tracing:
         before = scan._nvmap
@@ -46,6 +46,6 @@ def _held(f: Callable[..., T], carry: T | None, *args: jax.Array) -> T:
 
 
 def _barrier(leaf: PyTree) -> PyTree:
-    """Return a leaf behind a barrier, unless it is a type of joint: the trace depends on those."""
+    """Return a leaf behind an optimisation barrier, except types of joints, on which the trace depends."""
     is_static = not isinstance(leaf, jax.Array) or not jnp.issubdtype(leaf.dtype, jnp.inexact)
     return leaf if is_static else jax.lax.optimization_barrier(leaf)

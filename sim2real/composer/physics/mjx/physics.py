@@ -1,4 +1,4 @@
-"""A model and its state on MJX, inside a compiled program; hooks see the interface of the C engine's physics."""
+"""A model and its state on MJX, inside a compiled program, with the interface of the C engine's physics."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 
 _FLUID = ("opt.density", "opt.viscosity", "opt.wind")
 _SWITCHES = {**dict.fromkeys(_FLUID, "opt._impl.has_fluid_params"), "body_gravcomp": "flg_gravcomp"}
-"""What MJX leaves out of a program because it was 0 when the model was compiled; set, it has to be in."""
+"""Fields -> parts that MJX leaves out of a program if they are 0 in the compiled model, and that are needed once set.
+"""
 _WARP_SWITCHES: dict[str, str] = dict.fromkeys(_FLUID, "_impl.has_fluid")
 """The same on Warp."""
 
@@ -36,7 +37,7 @@ Carried = tuple[mjx.Data, dict[str, jax.Array], dict[str, PyTree], jax.Array, di
 
 
 _MATRICES = ("xmat", "ximat", "geom_xmat", "site_xmat", "cam_xmat")
-"""MJX keeps them as ``(n, 3, 3)``, MuJoCo as ``(n, 9)``."""
+"""Fields that MJX stores as ``(n, 3, 3)``, MuJoCo as ``(n, 9)``."""
 
 
 class MjxPhysics(BasePhysics):
@@ -45,12 +46,12 @@ class MjxPhysics(BasePhysics):
     Setting something replaces the state that this object holds; arrays that were read before keep their values.
 
     Args:
-        variables: What tasks keep from hook to hook: name -> array.
-        legacy: After a step, also compute positions and velocities of the new state.
+        variables: Values that tasks keep between hooks: name -> array.
+        legacy: Whether to compute positions and velocities of the new state after a step.
 
     Attributes:
         changed: Names of the model's fields that were set.
-        dry: Whether steps compute nothing: for finding out what hooks set and keep.
+        dry: Whether steps compute nothing, to find the values that hooks set.
         failed: Whether no acceptable initial state was found, a boolean array.
     """
 
@@ -80,7 +81,7 @@ class MjxPhysics(BasePhysics):
         self.named = Named(host, self.model, self.data)
 
     def read(self, field: layout.Field) -> PyTree:
-        """Return a whole field; all quantities are computed first when an earlier write makes it out of date."""
+        """Return a whole field; if an earlier write made it out of date, all quantities are computed first."""
         if not field.triggers:
             self._settle()
         if field.struct == "model":
@@ -94,10 +95,10 @@ class MjxPhysics(BasePhysics):
         self.is_dirty = True
 
     def _settle(self) -> None:
-        """Compute everything that follows from the state where something was written since that was last done.
+        """Compute all derived quantities if something was written since they were last computed.
 
-        As a rule the trace decides whether that is the case. Where it cannot, because that depends on the step
-        before, it belongs to the state, and the program decides.
+        Usually this is known during the trace. If it depends on the step before, a flag in the state lets the program
+        decide.
         """
         dirty, where = self.is_dirty, self._where
         if dirty is False:
@@ -113,7 +114,7 @@ class MjxPhysics(BasePhysics):
 
     @contextlib.contextmanager
     def only_where(self, condition: jax.Array) -> Iterator[None]:
-        """Let reads inside a ``with`` block compute no quantities where a condition, a boolean array, does not hold."""
+        """Let reads in a ``with`` block compute quantities only where a condition, a boolean array, is true."""
         self._where = condition
         try:
             yield
@@ -121,19 +122,19 @@ class MjxPhysics(BasePhysics):
             self._where = None
 
     def check(self, struct: str, name: str, rows: int | slice | np.ndarray = slice(None)) -> None:
-        """Refuse to set rows of a field where MJX would not see it.
+        """Refuse to set rows of a field if MJX would ignore it.
 
         Args:
-            rows: Which rows of it; default: all.
+            rows: Rows of the field; default: all.
 
         Raises:
-            UsageError: With the field.
+            UsageError: MJX would ignore the field.
         """
         if struct != "model" or stepping.is_warp(self.mjx_model):
             return
         if name.endswith("_frictionloss") and not np.all(np.asarray(getattr(self.host, name))[rows] > 0):
             raise UsageError(
-                f"MJX leaves out {name!r} where it is 0 in the compiled model, and it is set there",
+                f"MJX ignores {name!r} in rows that are 0 in the compiled model, and these rows are set",
                 hint="compile the model with a small friction, such as 1e-6",
             )
         if name == "geom_size" and np.any(self.host.geom_type == mj.mjtGeom.mjGEOM_HFIELD):
@@ -146,7 +147,7 @@ class MjxPhysics(BasePhysics):
         """Set a whole field of the model or the state, such as ``qpos``, ``geom_size`` or ``opt.gravity``.
 
         Raises:
-            UsageError: When the field is a constant of compiled programs.
+            UsageError: The field is a constant of compiled programs.
         """
         holder = self.mjx_model if struct == "model" else self.mjx_data
         current = _get(holder, name)
@@ -166,7 +167,7 @@ class MjxPhysics(BasePhysics):
         self.switch_on()
 
     def switch_on(self) -> None:
-        """Have programs compute what follows from fields that hooks set, though they were 0 in the compiled model."""
+        """Let programs compute the effects of fields that hooks set although they are 0 in the compiled model."""
         on_warp = stepping.is_warp(self.mjx_model)
         switches: dict[str, str] = _WARP_SWITCHES if on_warp else _SWITCHES
         for path in {switches[name] for name in self.changed if name in switches}:
@@ -194,13 +195,13 @@ class MjxPhysics(BasePhysics):
     # -- the interface of the C engine's physics
 
     def set_control(self, control: ArrayLike) -> None:
-        """Set the controls, shape ``(nu,)`` [the actuators' units]; UsageError when the shape is another."""
+        """Set the controls, shape ``(nu,)`` [the actuators' units]; raise UsageError for another shape."""
         old = self.mjx_data.ctrl
         control = jnp.asarray(control, old.dtype)
         if control.size not in (1, old.size):
             raise UsageError(
                 f"there are {old.size} controls, and set_control was given an array of shape {control.shape}",
-                hint="a task whose actions are something else overrides action_spec and before_step",
+                hint="if actions are no controls, override action_spec and before_step in the task",
             )
         self.mjx_data = self.mjx_data.replace(ctrl=jnp.broadcast_to(jnp.ravel(control), old.shape))
 
@@ -208,10 +209,10 @@ class MjxPhysics(BasePhysics):
         return array
 
     def reset(self, keyframe_id: int | None = None) -> None:
-        """Return to the initial state, or to a keyframe; variables are forgotten.
+        """Return to the initial state, or to a keyframe, and remove all variables.
 
         Raises:
-            UsageError: When there is no such keyframe.
+            UsageError: There is no such keyframe.
         """
         self.mjx_data = self.start
         if keyframe_id is not None:
@@ -233,14 +234,14 @@ class MjxPhysics(BasePhysics):
         self.is_dirty = False
 
     def suppress_physics_errors(self) -> contextlib.nullcontext[None]:
-        """MJX raises none."""
+        """Do nothing: MJX raises no errors of physics."""
         return contextlib.nullcontext()
 
     def _new_binding(self, kind: str, ids: tuple[int, ...], single: bool) -> MjxBinding:
         return MjxBinding(self, kind, ids, single)
 
     def fail(self, condition: ArrayLike = True) -> None:
-        """Note that no acceptable initial state was found where the condition holds; another attempt follows."""
+        """Reject the initial state where the condition is true; another attempt follows."""
         self.failed = self.failed | jnp.asarray(condition)
 
     # -- state as a tree
@@ -252,7 +253,7 @@ class MjxPhysics(BasePhysics):
         return self.mjx_data, leaves, variables, random_state.key, dict(random_state.memory)
 
     def load(self, tree: Carried, random_state: JaxRandomState) -> None:
-        """Take over what ``tree`` returned."""
+        """Set all changing values from a result of ``tree``."""
         self.mjx_data, leaves, variables, random_state.key, memory = tree
         if leaves:
             self.mjx_model = stepping.with_fields(self.mjx_model, leaves)
@@ -285,7 +286,7 @@ class MjxPhysics(BasePhysics):
 
 
 def _get(holder: PyTree, path: str) -> PyTree:
-    """Return a field of a model or a state by its path, None when there is none."""
+    """Return a field of a model or a state by its path, or None."""
     for step in path.split("."):
         holder = getattr(holder, step, None)
     return holder
@@ -295,7 +296,7 @@ SET_BEFORE = "set it in initialize_episode_mjcf or after_compile, which run befo
 
 
 def constant(name: str) -> UsageError:
-    """Return the error that a field cannot be set."""
+    """Return the error for setting a constant field."""
     return UsageError(
         f"MJX cannot change {name!r} inside a compiled program: it is one of its constants", hint=SET_BEFORE
     )
@@ -316,21 +317,21 @@ class Struct:
 
 
 def shown(value: PyTree, name: str) -> PyTree:
-    """Return a value of the compiled model as hooks may see it."""
+    """Return a value of the compiled model for hooks, which cannot change it."""
     if isinstance(value, np.ndarray):
         return read_only(value.view())
     return Struct(value, name) if type(value).__module__.startswith("mujoco") and not callable(value) else value
 
 
 def read_only(array: PyTree) -> PyTree:
-    """Return an array of numpy's, which is the same in all copies, after switching writes into it off."""
+    """Make a numpy array read-only, because all copies share it."""
     if isinstance(array, np.ndarray):
         array.flags.writeable = False
     return array
 
 
 class OptionView:
-    """``physics.model.opt``: gravity, wind and so on belong to each copy and can be set; the rest is constant."""
+    """``physics.model.opt``: gravity, wind and so on can be set for each copy; other options are constant."""
 
     def __init__(self, physics: MjxPhysics) -> None:
         object.__setattr__(self, "_physics", physics)
@@ -373,7 +374,7 @@ class MjxDataView:
             raise AttributeError(name)
         data = self._physics.mjx_data
         value = getattr(data, name) if name in data.__dataclass_fields__ else getattr(data._impl, name)
-        if value is None:  # what all copies have in common on Warp
+        if value is None:  # arrays that all copies share on Warp
             raise AttributeError(f"a copy has no {name!r} of its own")
         return jnp.reshape(value, (-1, 9)) if name in _MATRICES else value
 
@@ -401,6 +402,6 @@ class MjxBinding(BaseBinding):
 
 
 def freeze(model: MjModel) -> None:
-    """Make the arrays of a compiled ``MjModel`` read-only: programs no longer look at them."""
+    """Make the arrays of a compiled ``MjModel`` read-only, because programs no longer read them."""
     for name in layout.array_fields("model"):
         read_only(getattr(model, name))

@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 
 Size = int | Sequence[int] | None
-"""The shape of a draw; None: that of the parameters."""
+"""The shape of a draw; None: the shape of the parameters."""
 
 
 class Registry:
-    """Which variations keep something from draw to draw, such as the position of a random walk.
+    """The values that variations keep from draw to draw, such as the position of a random walk.
 
     Attributes:
         initial: Name -> value at the start of an episode.
@@ -33,7 +33,7 @@ class Registry:
         self._owners: list[Variation] = []
 
     def name(self, owner: Variation, initial: ArrayLike) -> str:
-        """Return the name of what an owner keeps."""
+        """Return the name of an owner's value."""
         number = next((i for i, other in enumerate(self._owners) if other is owner), None)
         if number is None:
             number = len(self._owners)
@@ -47,10 +47,10 @@ class JaxRandomState:
     """Draws like a ``RandomState``, by methods with the same arguments, from a JAX key that it splits at every draw.
 
     Args:
-        memory: What variations keep from draw to draw: name -> array.
+        memory: Values that variations keep from draw to draw: name -> array.
 
     Attributes:
-        memory: The same dictionary, with new values.
+        memory: This dictionary, with new values.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class JaxRandomState:
         self._registry = registry or Registry()
 
     def recall(self, owner: Variation, initial: ArrayLike) -> jax.Array:
-        """Return what a variation kept at its last draw, or its initial value."""
+        """Return the value of a variation at its last draw, or its initial value."""
         name = self._registry.name(owner, initial)
         return self.memory[name] if name in self.memory else jnp.asarray(initial)
 
@@ -90,7 +90,7 @@ class JaxRandomState:
         return jnp.asarray(scale, float) * jax.random.exponential(self.next_key(), _shape(size, scale))
 
     def poisson(self, lam: ArrayLike = 1.0, size: Size = None) -> jax.Array:
-        # JAX draws Poisson numbers with threefry keys only.
+        # JAX draws Poisson numbers only with threefry keys.
         key = jax.random.wrap_key_data(jax.random.key_data(self.next_key()), impl="threefry2x32")
         return jax.random.poisson(key, lam, _shape(size, lam))
 
@@ -121,7 +121,7 @@ class JaxRandomState:
         return scale * jax.random.gamma(self.next_key(), shape, _shape(size, shape, scale))
 
     def shuffle(self, x: ArrayLike) -> None:
-        """Refuse to work in place; UsageError always."""
+        """Raise a UsageError: on MJX arrays cannot be changed in place."""
         raise UsageError("random_state.shuffle works in place", hint="use x = random_state.permutation(x)")
 
     def __getattr__(self, name: str) -> Any:

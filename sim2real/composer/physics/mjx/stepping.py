@@ -1,7 +1,7 @@
-"""One step of MJX that ends where one of dm_control's ends, and the state that an episode starts from.
+"""A step of MJX that computes the same quantities as a step of dm_control, and the first state of an episode.
 
-Each stage is jitted on its own: MJX is traced once for all programs with a model of one form, also in several places,
-for a batch or for a derivative. That shortens compilation.
+Each stage is jitted separately, so that MJX is traced once for all programs with a model of one form, for every use,
+batch and derivative. That shortens compilation.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def varies(path: str) -> bool:
 
 
 def check_field(path: str) -> None:
-    """Refuse a field of the model that cannot differ from copy to copy; UsageError with the field."""
+    """Refuse a field of the model that cannot differ from copy to copy."""
     if not varies(path):
         raise UsageError(
             f"MJX-Warp cannot change {path!r}: it is the same in all copies",
@@ -46,24 +46,24 @@ def check_field(path: str) -> None:
 
 
 def is_warp(model: mjx.Model) -> bool:
-    """Return whether an ``mjx.Model`` is MuJoCo Warp's."""
+    """Return whether an ``mjx.Model`` is for MuJoCo Warp."""
     return model.impl == mjx.Impl.WARP
 
 
 class Engine(Protocol):
-    """What steps a model: MJX in JAX, or MuJoCo Warp."""
+    """An engine that steps a model: MJX in JAX, or MuJoCo Warp."""
 
     def advance(self, model: mjx.Model, data: mjx.Data, legacy: bool) -> mjx.Data:
         """Return the data a time step later.
 
         Args:
-            legacy: Whether positions and velocities of the new state are computed too, as in dm_control. The data must
-                then be consistent: what ``forward`` or an earlier step returned.
+            legacy: Whether positions and velocities of the new state are computed, too, as in dm_control. Then the data
+                must come from ``forward`` or from an earlier step.
         """
         ...
 
     def forward(self, model: mjx.Model, data: mjx.Data, actuation: bool = True) -> mjx.Data:
-        """Compute everything that follows from the state; without actuation, as at the start of an episode."""
+        """Compute all derived quantities; at the start of an episode, without actuation."""
         ...
 
 
@@ -73,7 +73,7 @@ class JaxEngine(Engine):
     def advance(self, model: mjx.Model, data: mjx.Data, legacy: bool) -> mjx.Data:
         if not legacy:
             return _integrate(model, _forward(model, data))
-        # The same stages as without legacy, begun elsewhere (``mj_step2; mj_step1``): it is no dearer.
+        # The same stages as without legacy, in another order (``mj_step2; mj_step1``), in the same time.
         rk4 = model.opt.integrator == mjx.IntegratorType.RK4
         return _positions(model, _integrate(model, _forward(model, data) if rk4 else _react(model, data)))
 
@@ -85,7 +85,7 @@ class JaxEngine(Engine):
 
 
 def _forward(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Compute what ``mjx.forward`` does, which leaves accelerometers at 0 in models without constraints."""
+    """Compute ``mjx.forward``, and accelerometers, which it leaves at 0 in models without constraints."""
     return _react(model, _positions(model, data))
 
 
@@ -93,7 +93,7 @@ def _forward(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 @held_links()
 def _integrate(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     if model.opt.integrator == mjx.IntegratorType.RK4:
-        # MuJoCo leaves sensors as they were before the step, mjx.rungekutta4 as in its last stage
+        # MuJoCo keeps sensors from before the step, mjx.rungekutta4 those of its last stage
         return mjx.rungekutta4(model, data).replace(sensordata=data.sensordata)
     return mjx.euler(model, data) if model.opt.integrator == mjx.IntegratorType.EULER else mjx.implicit(model, data)
 
@@ -103,8 +103,8 @@ def _integrate(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 def _positions(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Compute the quantities of positions and velocities, and set the state as MuJoCo does.
 
-    MJX writes quaternions back normalized, and has velocities of actuators that are switched off; MuJoCo has zeros.
-    A joint that was compiled with dry friction, and has none or one that underflows, MJX brakes without a limit.
+    MJX normalises quaternions in the state, and computes velocities of disabled actuators; MuJoCo has zeros. A joint
+    that was compiled with dry friction, and has none or one that underflows, MJX brakes without a limit.
     """
     model = with_fields(model, {"dof_frictionloss": jnp.maximum(model.dof_frictionloss, _LEAST_FRICTION)})
     qpos = data.qpos
@@ -119,9 +119,9 @@ def _positions(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 @jax.jit
 @held_links()
 def _react(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Compute forces and accelerations from what follows from positions and velocities."""
+    """Compute forces and accelerations, given the quantities of positions and velocities."""
     data = mjx.fwd_actuation(model, data)
-    if model.opt.disableflags & mjx.DisableBit.ACTUATION:  # MJX leaves what an earlier step computed
+    if model.opt.disableflags & mjx.DisableBit.ACTUATION:  # MJX would keep values of an earlier step
         data = data.replace(actuator_force=jnp.zeros_like(data.actuator_force))
     data = mjx.fwd_acceleration(model, data)
     impl: PyTree = data._impl

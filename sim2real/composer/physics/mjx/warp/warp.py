@@ -20,15 +20,15 @@ if TYPE_CHECKING:
 class WarpEngine(Engine):
     """Steps a model with MuJoCo Warp, in single precision, on a CUDA device or on the CPU.
 
-    MuJoCo Warp keeps the contacts of all copies in common arrays. They are created for every call and are no part of
-    the state. So all of the state belongs to one copy, and copies can be selected, sliced and merged as on MJX's JAX.
+    MuJoCo Warp stores the contacts of all copies in common arrays. They are created in every call and do not belong to
+    the state. So each copy has its own state, and copies can be selected, sliced and merged as with MJX in JAX.
 
     Args:
         nconmax: Most contacts of a copy, on average: the copies share the room for all. None: MuJoCo Warp's guess.
         njmax: Most rows of the solver of each copy, for contacts, limits and equalities. None: MuJoCo Warp's guess.
 
     Raises:
-        UsageError: When the package or a device is missing, or MuJoCo Warp cannot run the model.
+        UsageError: The package or a device is missing, or MuJoCo Warp cannot run the model.
 
     Attributes:
         start: The ``mjx.Data`` of the model's initial state, before the first forward pass.
@@ -36,7 +36,7 @@ class WarpEngine(Engine):
 
     def __init__(self, host: MjModel, nconmax: int | None = None, njmax: int | None = None) -> None:
         for name, size in (("nconmax", nconmax), ("njmax", njmax)):
-            if size is not None and size < 1:  # 0 contacts would be no collisions at all, without a word
+            if size is not None and size < 1:  # room for 0 contacts would silently switch collisions off
                 raise UsageError(f"{name} is a number of at least 1, got {size}", hint="leave it out for a guess")
         device = find_device()
         try:
@@ -44,10 +44,10 @@ class WarpEngine(Engine):
             data: Any = mjx.make_data(host, impl="warp", device=device, naconmax=nconmax, njmax=njmax)
         except (NotImplementedError, ValueError) as error:
             raise UsageError(f"MJX-Warp cannot run this model: {error}", hint='use impl="jax"') from error
-        from sim2real.composer.physics.mjx.warp import warp_stages  # it imports Warp
+        from sim2real.composer.physics.mjx.warp import warp_stages  # imported late: it imports Warp
 
         self._stages = warp_stages
-        # Kernels print when something had no room, line by line, except when a solver stops at its limit.
+        # Let kernels print only when a solver stops at its limit, not for each thing that had no room.
         self.model = model.tree_replace({"opt._impl.warn_overflow": _short()})
         self._shared = {f"_impl.{k}": np.asarray(getattr(data._impl, k)) for k in _shared(data)}
         self.start = self._pack(data)
@@ -66,13 +66,13 @@ class WarpEngine(Engine):
         return with_fields(data, dict.fromkeys(self._shared))
 
     def _unpack(self, data: mjx.Data) -> mjx.Data:
-        # Contacts are where Warp has them, in arrays that JAX has no part in.
+        # Contacts stay in Warp's arrays, to which JAX has no access.
         new = {k: v[:0] if k.startswith("_impl.contact__") else v for k, v in self._shared.items()}
         return with_fields(data, {k: jnp.asarray(v) for k, v in new.items()})
 
 
 def make_engine(host: MjModel, impl: str, nconmax: int | None, njmax: int | None) -> WarpEngine | None:
-    """Return what steps a model with Warp; None with ``impl="jax"``.
+    """Return the engine for ``impl="warp"``; None for ``impl="jax"``.
 
     Args:
         nconmax: See ``WarpEngine``; None with JAX.
@@ -88,27 +88,27 @@ def make_engine(host: MjModel, impl: str, nconmax: int | None, njmax: int | None
 
 
 def overflowed(data: mjx.Data) -> jax.Array:
-    """Return whether contacts or constraints of a copy were dropped for lack of room, since its reset."""
+    """Return whether contacts or constraints of a copy were dropped for lack of room since its reset."""
     impl: Any = data._impl
     return (impl.overflow & _short()) != 0
 
 
 def _short() -> int:
-    """Return the flags that say that something had no room."""
+    """Return the flags for a lack of room."""
     from mujoco.mjx.warp import mjwp_types
 
     flags = mjwp_types.OverflowType
-    # A solver that stops at its limit has left nothing out, and stops there in C and in JAX as well.
+    # A solver that stops at its limit drops nothing; it also stops in C and in JAX.
     return int(flags.ALL & ~(flags.ITERATIONS | flags.LS_ITERATIONS))
 
 
 def find_device() -> Any:
-    """Return the device that JAX computes on; UsageError when Warp is not installed, or cannot use that device."""
+    """Return the device on which JAX computes; raise UsageError if Warp is missing or cannot use it."""
     from mujoco.mjx import warp as mjx_warp
 
     if not mjx_warp.WARP_INSTALLED or mjx_warp.mujoco_warp is None:
         raise UsageError('impl="warp": Warp is not installed', hint=with_extra("warp"))
-    config: Any = jax.config  # read() refuses an option that a context may change
+    config: Any = jax.config  # read the option so, because read() refuses options that a context may change
     device: Any = config.jax_default_device or jax.devices()[0]
     device = jax.devices(device)[0] if isinstance(device, str) else device
     if device.platform != "cpu" and not _is_cuda(device, mjx_warp.warp):
@@ -122,7 +122,7 @@ def find_device() -> Any:
 def _is_cuda(device: Any, warp: Any) -> bool:
     try:
         return device in jax.devices("cuda") and warp.is_cuda_available()
-    except RuntimeError:  # JAX has no such devices
+    except RuntimeError:  # JAX has no devices of this type
         return False
 
 

@@ -1,9 +1,8 @@
-"""Steps of MuJoCo Warp, their stages in an order of our own, as functions of JAX; imported where Warp is installed.
+"""Steps of MuJoCo Warp with their stages in another order, as functions of JAX; needs Warp.
 
-MJX offers whole steps of Warp only, which compute positions and velocities of the state before the step. Its functions
-are generated, with a thousand lines each that hand array after array to Warp and end in one call,
-``mujoco_warp.step(m, d)``. Here they are taken as they are, with another function at their end: those of the release
-that ``pyproject.toml`` pins.
+MJX offers only whole steps of Warp, which compute positions and velocities of the state before the step. Its functions
+are generated: a thousand lines hand array after array to Warp, and end in one call, ``mujoco_warp.step(m, d)``. Here
+the same functions, of the pinned release, end in another call.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ if TYPE_CHECKING:
 
 wp: Any = importlib.import_module("warp")  # an extra, which type checkers may not find
 Order = Callable[[types.Model, types.Data], None]
-"""A function of ``mujoco_warp``'s model and data, which it changes."""
+"""A function that changes the data of ``mujoco_warp``, given its model."""
 
 
 @wp.kernel
@@ -44,24 +43,25 @@ def _clear(sensors: wp.array[int], addresses: wp.array[int], values: wp.array2d[
 def _legacy(m: types.Model, d: types.Data) -> None:
     """Advance by a time step; positions and velocities of the new state are computed too (``mj_step2; mj_step1``).
 
-    The data hold positions and velocities of the state before. As contacts are not kept from step to step, they are
-    computed first, not last: in sum, each stage once, as in ``mujoco_warp.step``.
+    The data have positions and velocities of the state before. Contacts are not kept from step to step, so they are
+    computed first, not last; each stage runs once, as in ``mujoco_warp.step``.
     """
     integrator = mj.mjtIntegrator(m.opt.integrator)
     if _can_sleep(m):
         mujoco_warp.step(m, d)
     elif integrator == mj.mjtIntegrator.mjINT_RK4:
         mujoco_warp.forward(m, d)
-        measured, d.sensordata = d.sensordata, wp.empty_like(d.sensordata)  # stages within the step sense as well
+        # Stages within the step also compute sensors.
+        measured, d.sensordata = d.sensordata, wp.empty_like(d.sensordata)
         stages.rungekutta4(m, d)
         d.sensordata = measured
     else:
         collision_driver.collision(m, d)
         constraint.make_constraint(m, d)
-        d.sensordata.zero_()  # sensors of touch add to what is there
+        d.sensordata.zero_()  # touch sensors add to the present value
         _accelerations(m, d)
         (stages.euler if integrator == mj.mjtIntegrator.mjINT_EULER else stages.implicit)(m, d)
-    saved = d.cacc, d.cfrc_int  # what follows takes them for scratch
+    saved = d.cacc, d.cfrc_int  # later stages use these arrays as scratch memory
     if _asks_for_accelerations(m):
         d.cacc, d.cfrc_int = wp.zeros_like(d.cacc), wp.zeros_like(d.cfrc_int)
     _positions_and_velocities(m, d)
@@ -69,7 +69,7 @@ def _legacy(m: types.Model, d: types.Data) -> None:
 
 
 def _accelerations(m: types.Model, d: types.Data) -> None:
-    """Compute what follows from positions, velocities and controls."""
+    """Compute accelerations from positions, velocities and controls."""
     stages.fwd_actuation(m, d)
     stages.fwd_acceleration(m, d, factorize=True)
     solver.solve(m, d)
@@ -79,9 +79,9 @@ def _accelerations(m: types.Model, d: types.Data) -> None:
 
 
 def _positions_and_velocities(m: types.Model, d: types.Data) -> None:
-    """Compute what follows from positions and velocities, with contacts only where sensors ask for them."""
+    """Compute the quantities of positions and velocities; contacts only if sensors need them."""
     limits = (m.sensor_limitpos_adr, m.sensor_limitvel_adr)
-    for sensors in limits:  # they are only written where a limit is near
+    for sensors in limits:  # these are written only near a limit
         wp.launch(_clear, dim=(d.nworld, sensors.size), inputs=[sensors, m.sensor_adr], outputs=[d.sensordata])
     if m.nsensorcollision or any(s.size for s in (*limits, m.sensor_contact_pos_adr)) or _can_sleep(m):
         stages.fwd_position(m, d, factorize=False)
@@ -108,7 +108,7 @@ def _asks_for_accelerations(m: types.Model) -> bool:
 
 
 def _with_room(order: Order, m: types.Model, d: types.Data) -> None:
-    """Run a function with room for the contacts of all copies, in memory that Warp takes for the time of the call."""
+    """Run a function with room for the contacts of all copies, in memory that Warp allocates for the call."""
     saved = d.contact, d.naconmax, d.naccdmax
     d.naconmax, d.naccdmax = d.naconmax * d.nworld, d.naccdmax * d.nworld
     new = {}
@@ -122,9 +122,9 @@ def _with_room(order: Order, m: types.Model, d: types.Data) -> None:
 
 
 def _function(name: str, order: Order) -> Callable[[mjx.Model, mjx.Data], mjx.Data]:
-    """Return MJX's function of a model and of data, for ``vmap`` and ``jit``, with another of Warp in its place.
+    """Return MJX's function of model and data, for ``vmap`` and ``jit``, with another function of Warp in it.
 
-    Sizes of contacts in the data are those of one copy; the arrays that hold contacts are empty.
+    Sizes of contacts in the data are for one copy; the arrays of contacts are empty.
     """
     room = functools.partial(_with_room, order)
     shim = getattr(generated, f"_{name}_shim").__wrapped__
@@ -137,10 +137,10 @@ def _function(name: str, order: Order) -> Callable[[mjx.Model, mjx.Data], mjx.Da
 
 
 def _once(model: mjx.Model, is_batched: mjx.Model) -> mjx.Model:
-    """Return a model of many copies that has once what Warp takes once, though ``vmap`` gave it to every copy."""
+    """Return a model of many copies with a single copy of the fields that Warp takes once, despite ``vmap``."""
 
     def of_first(path: tuple[object, ...], leaf: jax.Array, is_many: bool) -> jax.Array:
-        names = [getattr(step, "name", "") for step in path]  # '' where a tuple of arrays, in common, has its parts
+        names = [getattr(step, "name", "") for step in path]  # '' for the parts of a common tuple of arrays
         varied = all(names) and varies(".".join(name for name in names if name != "_impl"))
         return leaf if varied or not is_many else leaf[0]
 
@@ -148,7 +148,7 @@ def _once(model: mjx.Model, is_batched: mjx.Model) -> mjx.Model:
 
 
 def _in(source: FunctionType, **names: object) -> FunctionType:
-    """Return a copy of a function for which global names stand for something else."""
+    """Return a copy of a function with other values for some global names."""
     new = FunctionType(source.__code__, {**source.__globals__, **names}, source.__name__, source.__defaults__)
     new.__annotations__ = source.__annotations__
     return new
@@ -157,6 +157,6 @@ def _in(source: FunctionType, **names: object) -> FunctionType:
 step = _function("step", mujoco_warp.step)
 """``mjx.step``, whose contacts Warp keeps."""
 legacy_step = _function("step", _legacy)
-"""A step that ends with positions and velocities of the new state; the data hold those of the state before."""
+"""A step that ends with positions and velocities of the new state; the input has those of the state before."""
 forward = _function("forward", mujoco_warp.forward)
 """``mjx.forward``, whose contacts Warp keeps."""
