@@ -143,7 +143,7 @@ class TracedHooks(Hooks):
 
 
 def _compare(label: str, owner: object, before: dict[str, object], after: dict[str, object]) -> None:
-    """Refuse changes, except to set attributes that were absent or None, to values outside of the simulation."""
+    """Refuse changes of attributes; absent ones and None may be set, except to traced values."""
     for name in sorted({*before, *after}):
         old, new = before.get(name, _fingerprint(None)), after.get(name, _fingerprint(None))
         what = f"{type(owner).__name__}.{name}"

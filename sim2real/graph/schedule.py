@@ -225,7 +225,7 @@ class _BlockingRun:
         self.vertex.start[:, k], self.vertex.end[:, k] = begin, self.previous
 
     def _last_arrival(self, connection: Connection, upto: int) -> np.ndarray:
-        """Return the last arrival [ticks] of messages before ``upto``; 0: no new ones; ``NEVER``: fewer are sent."""
+        """Return the last arrival [ticks] of messages before ``upto``; 0: none is new; ``NEVER``: one is never sent."""
         key = (self.node.name, connection.name)
         ends = self.vertices[connection.output_node.name].end
         if key not in self.received:

@@ -41,7 +41,7 @@ _SEARCHED = 8
 MOST_OF_FIT = 4e7
 """If a Jacobian takes more steps of single joints, a fit uses fewer segments: about 30 s on two cores."""
 MOST_OF_SETS = 8e6
-"""The same for a first descent, for baselines, and for sets of terms that are compared: about 4 s."""
+"""Most steps of single joints in a Jacobian of a first descent, of baselines or of a comparison of terms: about 4 s."""
 _BESIDE = 4
 """The time of a model's step that does not depend on the number of joints, as a number of joints."""
 _FEWEST = 2

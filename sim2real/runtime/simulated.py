@@ -247,7 +247,7 @@ class SimulatedRun:
                 "no node can step: the timeline has steps that wait for messages without a sender",
                 hint="draw it with sim2real.graph.schedule.draw for these nodes",
             )
-        player = min(ready, key=lambda p: p.begins[p.k])  # of equals, the first in the graph's order
+        player = min(ready, key=lambda p: p.begins[p.k])  # at equal times, the first node in the graph's order
         begin = player.begins[player.k]
         self._now = max(self._now, begin)
         # Take in the messages that the step consumes.

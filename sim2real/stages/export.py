@@ -30,7 +30,7 @@ from sim2real.types import Json
 
 FORMATS = ("mjcf", "mjlab", "isaaclab", "json", "card")
 _PLAIN = {"gain", "stiffness", "damping", "viscous", "coulomb", "armature", "gravity", "delay"}
-"""Parts of parameter paths -> counterparts in MuJoCo's joints and drives."""
+"""Last names of parameter paths that have a counterpart in MuJoCo's joints and drives."""
 _SESSION: tuple[str, ...] = ("firmware", "voltage", "temperature")
 """Facts about the hardware that a log may hold, in its metadata or as a measurement."""
 

@@ -141,7 +141,7 @@ class LogSource:
             return None
         thinned, lateness = _thinned(episode)
         tab = episode_tab(self._entity, self._entity, outputs_of(thinned), [])
-        # The last plot gets the latest step of each group.
+        # The last plot shows the lateness of these steps.
         curves = [
             Curve(f"{self._entity}/lateness/{node}", node, "", steps.woken / TICKS_PER_S, lateness[node])
             for node, steps in thinned.steps.items()
@@ -153,7 +153,7 @@ class LogSource:
 
 
 def _thinned(episode: Episode) -> tuple[Episode, dict[str, np.ndarray]]:
-    """Return an episode with the latest step of each group of steps, and the lateness of these steps [ms]."""
+    """Return an episode with the most late step of each group of steps, and the lateness of these steps [ms]."""
     steps, outputs, lateness = {}, {}, {}
     for node, every in episode.steps.items():
         rate_hz = float(episode.metadata.get("graph", {}).get(node, {}).get("rate_hz", ROWS_PER_S))

@@ -49,7 +49,10 @@ def test_a_grid_is_named_in_its_order():
 @pytest.mark.parametrize(
     ("texts", "message"),
     [
-        (["hidden=3,4"], r"hidden cannot be swept: it sets the shape[\s\S]*hint: settings that can: learning_rate"),
+        (
+            ["hidden=3,4"],
+            r"hidden cannot be swept: it sets the shape[\s\S]*hint: settings that can be swept: learning_rate",
+        ),
         (["num_envs=64,128"], "num_envs cannot be swept"),
         (["gama=0.9"], "gama cannot be swept: it is no setting of PPO"),
         (["gamma"], "'gamma' is no list of different numbers"),

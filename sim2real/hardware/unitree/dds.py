@@ -90,7 +90,7 @@ class Address:
 
 
 _DOMAINS: Final[dict[int, tuple[Address, Domain]]] = {}
-"""Domains that this process has opened -> configuration: Cyclone DDS has one for each domain."""
+"""Number of a domain that this process has opened -> address and domain: one configuration for each domain."""
 
 
 class DdsLink:

@@ -39,7 +39,7 @@ class Late:
 
 
 def late_mjcf(text: str, terms: Terms, late: Late, about: Sequence[tuple[str, str]]) -> str:
-    """Return a model with delays, profiles, sensors of its joints, and its intervals."""
+    """Return the MJCF with delays, speed limits of setpoints, joint sensors, and intervals as ``numeric`` elements."""
     spec = _mj.MjSpec.from_string(text)
     step_s, delays = spec.option.timestep, terms.delays
     for actuator in spec.actuators:

@@ -27,7 +27,7 @@ LEAST = 50
 """Fewest samples that can be checked."""
 _LAGS_S = (-0.3, 0.6)
 _CLOCK_LAGS_S = (-1.0, 1.5)
-"""Number of parts that are compared one by one, because a clock that was set changes the lag."""
+"""Range of lags of single parts of a recording [s]; it is wider, because a clock that was set changes the lag."""
 _APART_S = 60.0
 """Largest offset between two clocks that is found [s]."""
 _FOLLOWS_R = 0.8

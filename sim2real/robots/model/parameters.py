@@ -499,7 +499,7 @@ def _nominal(
 def place(
     placed: Sequence[ParameterAt], values: Mapping[str, Scalar], base: PyTree, joints: np.ndarray, dofs: np.ndarray
 ) -> PyTree:
-    """Return the world's parameters with values in their places.
+    """Put values of parameters into the world's parameters; return these.
 
     Args:
         base: ``DriveParams`` with nominal values.

@@ -143,7 +143,7 @@ class Bench:
 
     def _recorder(self, graph: AsyncGraph, state: GraphState, log: Path) -> McapRecorder:
         """Return the log's writer, whose metadata describe the session."""
-        # The graph as the log's metadata describes it.
+        # Describe the graph for the log's metadata.
         topology = {
             name: {
                 "rate_hz": node.rate,

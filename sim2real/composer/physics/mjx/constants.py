@@ -29,7 +29,7 @@ _WIDTHS = {
 _ONLY_SLIDES = 2
 """``body_simple`` of bodies that only slide along axes of the world; MuJoCo takes their mass for their inertia."""
 _IS_DERIVED = 11
-"""Indices of a weld's data that tell whether its pose is the one at the reference position."""
+"""Index of the number in a weld's data that tells whether its pose is the one at the reference position."""
 
 
 def derived(host: MjModel, model: mjx.Model) -> frozenset[str]:

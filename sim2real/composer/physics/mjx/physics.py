@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 
 _FLUID = ("opt.density", "opt.viscosity", "opt.wind")
 _SWITCHES = {**dict.fromkeys(_FLUID, "opt._impl.has_fluid_params"), "body_gravcomp": "flg_gravcomp"}
-"""Fields -> parts that MJX leaves out of a program if they are 0 in the compiled model, and that are needed once set.
+"""Field whose effect MJX leaves out if it is 0 in the compiled model -> the flag that switches the effect on once it is
+set.
 """
 _WARP_SWITCHES: dict[str, str] = dict.fromkeys(_FLUID, "_impl.has_fluid")
 """The same on Warp."""

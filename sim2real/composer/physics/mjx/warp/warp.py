@@ -47,7 +47,7 @@ class WarpEngine(Engine):
         from sim2real.composer.physics.mjx.warp import warp_stages  # imported late: it imports Warp
 
         self._stages = warp_stages
-        # Let kernels print only when a solver stops at its limit, not for each thing that had no room.
+        # Let kernels print when something had no room, but not when a solver stops at its limit.
         self.model = model.tree_replace({"opt._impl.warn_overflow": _short()})
         self._shared = {f"_impl.{k}": np.asarray(getattr(data._impl, k)) for k in _shared(data)}
         self.start = self._pack(data)
