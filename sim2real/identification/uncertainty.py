@@ -38,6 +38,8 @@ _BY_CHANCE = (0.2, 0.05)
 """Intervals begin to widen at the first probability that chance alone makes the parts differ as much, and widen in full
 at the second. With one sharp limit, the last digits of a fit decided whether an interval doubled.
 """
+_WITH_IT = 0.5
+"""A parameter vanishes with another one if it must change by this share so that the other one may be 0."""
 _TAKES_PART = 0.1
 """A parameter takes part in a direction if its entry is above this share of the largest entry."""
 _ORDER, _GAIN = 3, 20.0
@@ -168,7 +170,12 @@ def _with_absent(spread: Uncertainty, table: ParameterTable, at: Linearised, var
             loose = prior - np.diag(np.where(np.arange(len(at.x)) == i, freely * (1.0 - 1e-6), 0.0))
             root = root_of_inverse(information + loose)
             bound = values[i] + _ONE_SIDED * slope[i] * float(np.sqrt(root[i] @ root[i]))
-            if bound <= VAGUE * _ONE_SIDED * p.high:
+            # Where others would vanish with it, as gain, friction and inertia without a known force, only ratios count.
+            others = np.arange(len(at.x)) != i
+            full = information + loose
+            moved = np.linalg.solve(full[np.ix_(others, others)], full[others, i]) * values[i] / slope[i]
+            logs = np.array([q.transform == "log" for q in table.columns])[others]
+            if bound <= VAGUE * _ONE_SIDED * p.high and not (np.abs(moved[logs]) > _WITH_IT).any():
                 states[i], low[i], high[i] = ABSENT, 0.0, bound
     return replace(spread, state=tuple(states), low=low, high=high)
 
@@ -249,14 +256,19 @@ def determined(problem: Problem, at: Linearised, without: Collection[str] = ()) 
     # Find the directions that the data does not determine, and the parameters that move together along them.
     open_axes = np.where(held[:, None], 0.0, axes)[:, weights < 1.0 / VAGUE**2]
     open_axes = open_axes[:, np.abs(open_axes).max(axis=0, initial=0.0) > 1e-9]
-    groups, messages = _groups(open_axes), []
+    groups, messages, alone = _groups(open_axes), [], []
     for group in groups:
         names = [table.names[i] for i in group]
         rank = int((np.linalg.svd(open_axes[group], compute_uv=False) > 0.05).sum())
         if rank < len(group):
             messages.append(f"only combinations of {', '.join(names)} are determined: fix {rank} of them")
         else:
-            messages.append(f"nothing in this data determines {', '.join(names)}: excite it, fix it or give it a prior")
+            alone += names
+    if alone:
+        it = "it" if len(alone) == 1 else "them"
+        messages.append(
+            f"nothing in this data determines {', '.join(alone)}: excite {it}, fix {it} or give {it} a prior"
+        )
     undetermined = tuple(tuple(table.names[i] for i in g) for g in groups)
     expected = dict(zip(table.names, minute.tolist(), strict=True))
     return Determined(undetermined, tuple(messages), expected)

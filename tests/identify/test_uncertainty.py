@@ -214,6 +214,15 @@ def test_a_friction_that_may_be_0_has_an_upper_bound_and_is_no_open_question():
     assert vague.state[1] == "not determined"
 
 
+def test_what_may_be_0_only_if_others_vanish_with_it_is_no_absent_parameter():
+    """Of gain and damping without a known force only the ratio counts: halves of both fit as well, zeros do not."""
+    damping = Parameter("damping", "N m s/rad", 0.1, 0.001, 1.0, vanishes=True)
+    table = table_of(Parameter("gain", "1", 1.0, 0.1, 10.0), damping)
+    at = linear(table, [0.0, np.log(0.01)], [50.0, 0.0])
+    at.jacobian[..., 1] = -at.jacobian[..., 0]
+    assert from_linearised(stub(table), at).state[1] == "not determined"
+
+
 def test_a_limit_that_no_motion_reaches_is_told_as_that():
     limit = Parameter("torque", "N m", 2.0, 0.5, 50.0, limits=True, term="torque", off=1e9)
     table = table_of(Parameter("gain", "1", 1.0, 0.1, 10.0), limit)

@@ -52,6 +52,18 @@ def test_a_group_has_the_name_of_what_its_joints_share(joints, different, names)
     assert {n for n in placed(arm(joints, gains, [1] * len(joints)), joints) if n.startswith("kp")} == names
 
 
+def test_friction_that_the_file_does_not_have_may_be_far_below_the_guess():
+    """A rail without friction: a bound of a fiftieth bent gain, damping and inertia, which only friction kept apart."""
+    model = arm(["a", "b"], [(20, 1)] * 2, [1, 1])
+    model.dof_frictionloss[0] = 0.05
+    found = {
+        p.parameter.name: p.parameter
+        for p in expand(usual_patterns(("goal",), False, model, ["a", "b"]), ["a", "b"], model, model)
+    }
+    assert found["frictionloss_a"].low == pytest.approx(0.001)
+    assert found["frictionloss_b"].low == pytest.approx(1e-5)
+
+
 def test_like_joints_have_one_value():
     joints = ["x", "y"]
     assert {"kp", "damping", "armature"} < placed(arm(joints, [(20, 1)] * 2, [1, 1]), joints).keys()

@@ -46,7 +46,7 @@ def error(log="b.mcap", size=0.004, expected=0.02, free_run=False, **changes):
         ([error()] * 99 + [error("bad.mcap", 0.031, free_run=True)], {}, False, "bad.mcap"),
         ([error(as_good=("standing still",))], {}, False, "standing still"),
         ([error()], {"refused": {"a.mcap": "it lasts 0.1 s"}}, False, "a.mcap"),
-        ([error(expected=None)], {}, True, "expects no error"),
+        ([error(expected=None)], {}, True, "names no expected error"),
     ],
 )
 def test_an_error_above_the_expected_one_is_named_and_fails(rows, changes, holds, named, monkeypatch, capsys):

@@ -485,7 +485,8 @@ def _zero(
             listed = ", ".join(
                 f"{size:+.3f} {unit}".rstrip() + f" from {at[k] - t_s[1][0]:.2f} s on" for k, size in moved
             )
-            text = f"{name} reads against its goal {listed}: one of them has another zero"
+            cause = "one of them has another zero" if leaps else "a zero has moved, or a load pulls"
+            text = f"{name} reads against its goal {listed}: {cause}"
             return [Check("zero", i, text, "refuse" if leaps else "warn")]
     if lag_s is None:
         return []

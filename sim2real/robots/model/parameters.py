@@ -325,6 +325,8 @@ def with_optional(
     return (*(replace(p, term=p.quantity.term) for p in patterns), *further, *sharing(patterns, joints, wanted))
 
 
+_LESS = 200.0
+"""Dry friction that the file does not have may be below the lower bound by this factor."""
 _SIDES = {"l", "r", "left", "right", "fl", "fr", "rl", "rr", "lf", "rf", "lr", "lh", "rh", "hl", "hr", "bl", "br",
           "front", "rear", "hind", "back", "upper", "lower", "joint"}  # fmt: skip
 """Words by which the names of like joints differ."""
@@ -438,6 +440,8 @@ def _parameter(
         low, high = nominal / quantity.low, nominal * quantity.high
         if what == "gain":  # the log may have the force at the joint, although the file's motor has a gear
             low, high = min(nominal, 1.0) / quantity.low, max(nominal, 1.0) * quantity.high
+        if what == "frictionloss" and nominal == quantity.nominal:  # a guess, as the file has none: it may be far less
+            low /= _LESS
     elif quantity.scale:
         size = _nominal(replace(pattern, what=quantity.scale, nominal=None, term="", free=True), names, file_model)
         low, high = size * quantity.low, size * quantity.high

@@ -41,6 +41,8 @@ def run(config: ImportConfig) -> None:
     if config.out is not None and len(sets[0]) > 1:
         raise UsageError(f"out names one log, but there are {len(sets[0])} episodes", hint="choose one with --episode")
     mapping, joints = configured_mapping(config), config.joints
+    if mapping and config.pipeline and not joints:
+        joints = hints_of(config).joints
     text = "" if mapping else None
     for tables in sets:
         # Convert the files by the mapping; if there is none, propose one for the first file.

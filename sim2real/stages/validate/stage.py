@@ -100,7 +100,7 @@ class Validation(Shown):
         if self.refused:
             return f"none of {', '.join(self.refused)}; holds on {which}"
         if any(e.expected is None for e in self.errors):
-            return f"better than the baselines on {which}; the identification expects no error for it"
+            return f"better than the baselines on {which}; the identification names no expected error for it"
         return f"holds on {which}"
 
     def about(self) -> dict[str, Json]:
