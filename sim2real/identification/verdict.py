@@ -103,6 +103,8 @@ def judge(
         status, deciding, flags = RECORD, [too_seldom, *deciding], ""
     elif status == CHANGE and not (flags or lacks.unexplained) and offers_terms():
         flags = "--terms auto"
+    if status == CHANGE and undetermined and not (flags or bounded):  # no flag helps; a motion that determines them may
+        status, deciding = RECORD, [*deciding, *undetermined]
     return Judgement(status, tuple(dict.fromkeys([*deciding, *reasons, *exceeded, *lacks.reasons])), flags)
 
 

@@ -97,6 +97,11 @@ def test_a_clock_that_was_set_in_between_is_found(step_s, weight):
     assert ("clock", -1, weight) in findings(t_goal=T + step_s * (T > 10.0))
 
 
+def test_streams_that_overlap_in_a_small_part_are_refused():
+    """A short part follows by chance."""
+    assert findings(t_goal=T + 17.0) == [("overlap", -1, "refuse")]
+
+
 @pytest.mark.parametrize("apart_s", [-4.0, 5.0])
 def test_clocks_that_are_set_apart_are_refused_with_the_seconds(apart_s):
     (found,) = [f for f in checks.check((T + apart_s, T), GOAL, Q, NAMES) if f.weight == "refuse"]

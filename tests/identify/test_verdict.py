@@ -174,6 +174,11 @@ def test_what_nothing_determines_is_not_helped_by_other_bounds():
     found = judge(rows(0.1, 1.0), check=check(("gain",)), doubts=["damping is held"])
     assert found.status == "record again"
     assert {"nothing in this data determines gain", "damping is held"} <= {*found.reasons}
+    # A joint that did not move is predicted no better than by nominal values: no flag helps, a motion does.
+    found = judge(rows(1.0, 1.0), check=check(("gain",)))
+    assert (found.status, found.next) == ("record again", "")
+    assert "no better than nominal" in found.reasons[0]
+    assert found.reasons[1] == "nothing in this data determines gain"
 
 
 def test_the_first_that_applies_is_the_status_and_all_are_reasons():

@@ -68,15 +68,16 @@ class Check:
         return CHECKS[self.name][0]
 
 
+_ONE_CLOCK = 'in a bag, stamps = "/TOPIC.log_time" is the recorder\'s clock; '
 CHECKS = {
     "follows": ("unit", ""),
     "slope": ("unit", "correct the unit, or name the other joints with --joints"),
     "sign": ("scale", "change the sign of that joint's scale, such as scale = [1, -1]"),
     "order": ("source", "list the sources in the order of the positions"),
     "lag": ("", "exchange the names, or correct stamp_offset"),
-    "overlap": ("", "stamp_offset of the commands adds seconds to their clock, in a mapping"),
+    "overlap": ("", _ONE_CLOCK + "stamp_offset of the commands adds seconds to their clock, in a mapping"),
     "short": ("", "record longer"),
-    "clock": ("", "stamp both streams with one clock, such as a recorder's"),
+    "clock": ("", _ONE_CLOCK + "else stamp both streams with one clock"),
     "copy": ("", "log the commands that were sent, not the measurements"),
     "zero": ("", "cut the file where the zero moves: --samples A:B"),
     "offset": ("", "give the goals an offset in a mapping, one number for each column"),
@@ -120,6 +121,10 @@ def check(
     if found is None:
         text = "the stamps of goals and positions overlap in fewer than 50 samples: nothing is checked"
         return [Check("overlap", -1, text, "refuse")]
+    both_s, shorter_s = min(t[-1] for t in t_s) - max(t[0] for t in t_s), min(float(np.ptp(t)) for t in t_s)
+    if both_s < 0.5 * shorter_s:  # by chance a short part fits
+        text = f"the stamps of goals and positions overlap in {both_s:.3g} of {shorter_s:.3g} s"
+        return [Check("overlap", -1, f"{text}: are they of one clock?", "refuse")]
     after_s = -1.5 * found.sample_s
     fits = found.fit(1.0, after_s), found.fit(-1.0, after_s), found.fit(1.0, _LAGS_S[0])
     judged = [_judge(found, fits, i, names, by_name, t_s, goal, position) for i in range(len(names))]
