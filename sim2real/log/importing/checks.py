@@ -173,7 +173,9 @@ def check_episode(episode: Episode, joints: Sequence[str] = (), by_name: bool = 
             continue
         flat = values.reshape(len(values), -1), position.reshape(len(position), -1)
         if units.get(goal) == units.get(name) and flat[0].shape[1] == flat[1].shape[1]:
-            names = joints if len(joints) == flat[1].shape[1] else list(map(str, range(flat[1].shape[1])))
+            names = (
+                joints if len(joints) == flat[1].shape[1] and all(joints) else list(map(str, range(flat[1].shape[1])))
+            )
             names = [f"joint {name}" if name.isdigit() else name for name in names]
             t_s = episode.steps["actuator"].begun_s, episode.steps["sensor"].begun_s
             findings += check(t_s, *flat, names, by_name, acting, units.get(name, ""))
@@ -299,6 +301,7 @@ def _judge(
     copied = moves and lead_r > 0.95 and is_copy(t_s, goal[:, i], position[:, i], lead_s)
     away = f"{name} is held at {level:.3g} by a goal of {held:.3g}: another sign, unit or zero"
     scale = f"{name} follows its goal (r {r:.2f}) with a slope of {slope:.3g}: unit or scale of one of them is wrong"
+    weak = scale.partition(":")[0] + ": another unit or scale, or a drive too weak for its load?"
     before = f"{name} moves {-lead_s:.3g} s before its goal: names are exchanged, or the clocks do not agree"
     table: list[tuple[str, Weight, bool, str]] = [
         ("copy", "refuse", copied,
@@ -317,7 +320,7 @@ def _judge(
         # A weak servo stays far short of its goal, but no servo goes far beyond it.
         ("slope", "refuse", not 0.15 < slope < 4.0, scale),
         ("sign", "refuse", sign < 0, f"{name} moves against its goal (r {against:.2f}): a sign of scale is wrong"),
-        ("slope", "ask", sign > 0 and not 0.5 < slope < 1.6, scale),
+        ("slope", "ask", sign > 0 and not 0.5 < slope < 1.6, weak),
         ("lag", "refuse", leads, before),
         ("sign", "ask", sign == 0, f"{name} fits its goal with either sign (r {r:.2f} and {against:.2f}): "
          "the motion repeats"),

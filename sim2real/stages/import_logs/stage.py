@@ -3,7 +3,7 @@
 import shlex
 import sys
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +42,8 @@ def run(config: ImportConfig) -> None:
         raise UsageError(f"out names one log, but there are {len(sets[0])} episodes", hint="choose one with --episode")
     mapping, joints = configured_mapping(config), config.joints
     if mapping and config.pipeline and not joints:
-        joints = hints_of(config).joints
+        with suppress(ImportError, UsageError):  # a pipeline may be a mapping alone; names are for messages
+            joints = hints_of(config).joints
     text = "" if mapping else None
     for tables in sets:
         # Convert the files by the mapping; if there is none, propose one for the first file.
