@@ -379,7 +379,7 @@ def _names(above: Sequence[tuple[int, str]], separator: str | None, width: int) 
 
     Below the names there may be a line of units; above names that repeat, a line of names of groups.
     """
-    below: list[str] = []
+    below, at = list[str](), 0
     for i, line in reversed(above):
         text = _COMMENT.sub("", line, count=1) if _COMMENT.match(line) else line
         # The line of names may have another separator than the numbers.
@@ -393,7 +393,7 @@ def _names(above: Sequence[tuple[int, str]], separator: str | None, width: int) 
             below, at = cells, i
         elif not _COMMENT.match(line):  # a line of another width is text: no names stand above it
             break
-    return (below, at) if below else (None, 0)
+    return below or None, at
 
 
 def numbers(texts: Sequence[str]) -> np.ndarray | str | None:
