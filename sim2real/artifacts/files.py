@@ -68,7 +68,7 @@ def read_json(path: Path, kind: type[T]) -> T:
         kind: A dataclass. Lists of numbers become arrays in fields that are arrays; null becomes NaN in numbers.
 
     Raises:
-        ValueError: When the file is no JSON, or an entry is missing or of another type; the message names the entry.
+        ValueError: The file is no JSON, or an entry is missing or of another type; the message names the entry.
     """
     try:
         document = _numbers(kind, msgspec.json.decode(path.read_bytes()))
@@ -168,8 +168,8 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """Return the arrays of an npz file.
 
     Raises:
-        ValueError: When it is no npz file.
-        OSError: When it cannot be read.
+        ValueError: It is no npz file.
+        OSError: It cannot be read.
     """
     try:
         with np.load(path, allow_pickle=False) as file:

@@ -189,7 +189,7 @@ class Entity(WithHooks):
         """Return a rotation of the world, shape ``(3, 3)`` or ``(9,)``, seen from this entity; same shape.
 
         Raises:
-            UsageError: When the shape is another.
+            UsageError: The shape is another.
         """
         frame = physics.bind(self.root_body).xmat
         xp = namespace(xmat, frame)
@@ -266,7 +266,7 @@ class Entity(WithHooks):
         """Return linear ``(3,)`` [m/s] and angular velocity ``(3,)`` [rad/s, local frame].
 
         Raises:
-            UsageError: When the entity has no free joint.
+            UsageError: The entity has no free joint.
         """
         holder, free = self._pose_holder()
         if not free:

@@ -340,7 +340,7 @@ class Replay:
         """Return what may be wrong beside what is known already."""
         delay_s = plant.get("delay_s", 0.0)
         # At first, soft or limited drives look like late and damped ones.
-        starts = [plant, *(plant.having({"kd": 1.0, "delay_s": d}) for d in (delay_s, 0.011, 0.6 * delay_s))]
+        starts = [plant, *(plant.with_values({"kd": 1.0, "delay_s": d}) for d in (delay_s, 0.011, 0.6 * delay_s))]
         for name, part in _PARTS.items():
             if self.drives.torque_driven and name in ("kp", "kd", "zero"):
                 continue
@@ -362,22 +362,22 @@ class Replay:
             numbers = np.array([of(p) for p in plants])
             errors = np.array([self.errors(p) for p in plants]) * np.where(numbers == part.usual, 0.9, 1.0)
             best = np.take_along_axis(numbers, errors.argmin(0)[None], 0)[0]
-            return plants[0].having({name: tuple(best.tolist())} if (best != part.usual).any() else {})
+            return plants[0].with_values({name: tuple(best.tolist())} if (best != part.usual).any() else {})
 
         # Other gains of one joint, which are no fault, look like a limit.
-        others = [start.having({"kp": p * start.get("kp"), "kd": d * start.get("kd")})
+        others = [start.with_values({"kp": p * start.get("kp"), "kd": d * start.get("kd")})
                   for p, d in ((0.85, 1.0), (1.18, 1.0), (1.0, 0.7), (1.0, 1.4))]  # fmt: skip
-        tried = [start, *(start.having({name: (v,) * len(self.scale)}) for v in part.grid), *others]
-        near = lambda at: [mixed([at, *(at.having({name: tuple(v)}) for v in part.near(of(at)))])]  # noqa: E731
+        tried = [start, *(start.with_values({name: (v,) * len(self.scale)}) for v in part.grid), *others]
+        near = lambda at: [mixed([at, *(at.with_values({name: tuple(v)}) for v in part.near(of(at)))])]  # noqa: E731
         return Candidate(part.fault, mixed(tried), lambda _: "", (near, *_NUISANCE), part.least)
 
     def _of_one(self, name: str, plant: Setting) -> Iterator[Candidate]:
         """Return a part for the joint whose error falls most if all joints have it."""
         part, joints = _PARTS[name], self.drives.joints
         if part.of == "one":
-            tried = [plant.having({f"{name} {j}": v for j in joints}) for v in part.grid]
+            tried = [plant.with_values({f"{name} {j}": v for j in joints}) for v in part.grid]
         else:
-            tried = [plant.having({name: v * plant.get(name) if name == "kp" else v}) for v in part.grid]
+            tried = [plant.with_values({name: v * plant.get(name) if name == "kp" else v}) for v in part.grid]
         better = self.errors(plant) - np.min([self.errors(p) for p in tried], axis=0)
         joint = joints[int(np.argmax(better))]
         if better.max() > 0.0 and f"{name} {joint}" not in plant:
@@ -419,7 +419,7 @@ def solve_plant(
     fitted = [start, *explain(start.setting, replay.error, replay.candidates, 0.0, dear=True)][-1].setting
     trained = contract.delay_s if trained_delay_s is None else trained_delay_s
     age_s = 0.0 if log.rows_are_steps or log.age_s is None else float(np.median(log.age_s))
-    nominal = Setting().having({"delay_s": max(0.0, (trained or 0.0) - age_s)})
+    nominal = Setting().with_values({"delay_s": max(0.0, (trained or 0.0) - age_s)})
     delay_s, base, best = fitted.get("delay_s", 0.0) + age_s, replay.error(nominal), replay.error(fitted)
     # Possible faults: name in the setting, fault, sentence, value, and the share by which it lowers the error.
     suspects = [
@@ -441,7 +441,7 @@ def solve_plant(
         rest = Setting(tuple((n, v) for n, v in fitted.values if n != name))
         moves = [*([_PARTS["kd"].move] if name != "kd" else []), *([_PARTS["kp"].move] if "kp" in rest else [])]
         if fault == "delay":
-            rest = rest.having({"delay_s": nominal.get("delay_s")})
+            rest = rest.with_values({"delay_s": nominal.get("delay_s")})
         else:
             moves.append(_DELAY.move)
         gap = replay.error(rest) - best
@@ -452,7 +452,7 @@ def solve_plant(
             share = float(np.clip(gap / max(base - best, gap, 1e-9), 0.0, 1.0))
             question = "timing" if fault == "delay" else "plant"
             findings.append(Finding(fault, question, text, share, {name.split()[0]: float(value)}))
-    nominal = nominal.having({"delay_s": fitted.get("delay_s", 0.0)})
+    nominal = nominal.with_values({"delay_s": fitted.get("delay_s", 0.0)})
     figures = {
         "error": base, "error_fitted": best, "delay_s": delay_s,
         **{n: fitted.get(n, part.usual) for n, part in _PARTS.items() if part.of not in ("one", "each")},

@@ -38,7 +38,7 @@ class Setting:
         """Return the value of a name; ``usual`` if the setting has none."""
         return dict(self.values).get(name, usual)
 
-    def having(self, values: Mapping[str, Any]) -> Setting:
+    def with_values(self, values: Mapping[str, Any]) -> Setting:
         """Return the setting with other values for some names."""
         return Setting(tuple(sorted((dict(self.values) | dict(values)).items())))
 
@@ -98,12 +98,12 @@ class Suspect:
     def move(self, at: Setting) -> Iterable[Setting]:
         """Return settings near a given one."""
         value = at.get(self.names[0], self.grid[0])
-        return [at.having(dict.fromkeys(self.names, v)) for v in self.near(value)]
+        return [at.with_values(dict.fromkeys(self.names, v)) for v in self.near(value)]
 
     def candidates(self, start: Setting, *more: Move) -> list[Candidate]:
         """Return a candidate for each value of the grid; ``more``: further moves."""
         moves = (self.move, *more)
-        return [Candidate(self.fault, start.having(dict.fromkeys(self.names, v)), self.says, moves, self.least)
+        return [Candidate(self.fault, start.with_values(dict.fromkeys(self.names, v)), self.says, moves, self.least)
                 for v in self.grid]  # fmt: skip
 
     def says(self, at: Setting) -> str:

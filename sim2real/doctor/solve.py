@@ -117,7 +117,7 @@ class Link:
         size, unit = given.shape[1], np.maximum(given.std(0), 1e-3)
 
         def made(theta: np.ndarray) -> Setting:
-            return how.having({"gain": tuple(1 + theta[:size]), "bias": tuple(theta[size:] * unit)})
+            return how.with_values({"gain": tuple(1 + theta[:size]), "bias": tuple(theta[size:] * unit)})
 
         pulled = lambda theta: np.append(self.residuals(made(theta), given), 0.01 * theta)  # noqa: E731
         return made(_fitted(pulled, 2 * size, 1e-2, 1.0))
@@ -210,7 +210,7 @@ class Link:
                 yield from Suspect("sign", names(what), text, [tuple(signs.tolist())]).candidates(how)
         if any(name in how for name in names("pose")) or (self._sees and "joint_pos" not in self.d.made):
             return
-        moved = lambda shift: how.having(dict.fromkeys(names("pose"), tuple(shift.tolist())))  # noqa: E731
+        moved = lambda shift: how.with_values(dict.fromkeys(names("pose"), tuple(shift.tolist())))  # noqa: E731
         offset = np.clip(_fitted(lambda s: self.residuals(moved(s)).ravel(), len(joints), 0.02, 0.1), -2.0, 2.0)
         offset[np.abs(offset) < 0.01] = 0.0
         worst = int(np.argmax(np.abs(offset)))

@@ -106,7 +106,7 @@ def rederive(episode: Episode, nodes: Mapping[str, BaseNode]) -> Timeline:
     has set itself are copied from the record.
 
     Raises:
-        UsageError: When the record lacks one of them.
+        UsageError: The record lacks one of them.
     """
     recorded = Timeline.from_episode(episode, nodes)
     missing = [n for n in nodes if n not in recorded.vertices]

@@ -367,7 +367,7 @@ def links(problem: Problem, x: np.ndarray) -> tuple[Link, ...]:
         x: Shape ``(P,)``: the estimate of a fit, from which dynamics and delays are estimated together.
 
     Raises:
-        UsageError: When no delay of the measurements is identified.
+        UsageError: No delay of the measurements is identified.
     """
     late, table = measured(problem.table), problem.table
     # Split the delay evenly between commands and measurements: single measurements may have a shorter delay than the

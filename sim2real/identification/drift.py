@@ -99,7 +99,7 @@ def drift(problem: Problem, posterior: Posterior, widening: float) -> tuple[Drif
         the estimate.
 
     Raises:
-        UsageError: When parameters of the posterior are not tested.
+        UsageError: Parameters of the posterior are not tested.
     """
     # Fit each change alone, with the other parameters within the posterior.
     table = problem.table

@@ -174,7 +174,7 @@ def _at_other_delays(problem: Problem, found: Refined, report: OnProgress | None
     delays = [i for i, c in enumerate(table.columns) if c.kind == "delay"]
     if not delays:
         return found
-    nodes, lively = problem.rollouts.graph.nodes, problem.liveliest(problem.part())
+    nodes, lively = problem.rollouts.graph.nodes, problem.segments_with_most_motion(problem.part())
     period_s = 1.0 / min(nodes[name].rate for name in problem.model.given)
     for _ in range(_TRIES):
         x, starts = found.x, []
@@ -233,7 +233,7 @@ def run_search(problem: Problem, start: np.ndarray, report: OnProgress | None = 
     """
     config, table = problem.config, problem.table
     # Few segments suffice for a search: all 23 segments of an arm took 2.6 times as long.
-    few = problem.liveliest(problem.part())
+    few = problem.segments_with_most_motion(problem.part())
 
     def losses(candidates: np.ndarray, middle: np.ndarray) -> np.ndarray:
         return problem.losses(candidates, middle, few)

@@ -36,7 +36,7 @@ def set_leaf(tree: PyTree, path: str, value: ArrayLike) -> PyTree:
         path: Such as ``world.model.dof_damping[0]``.
 
     Raises:
-        UsageError: When the path does not exist.
+        UsageError: The path does not exist.
     """
     return _set(tree, _steps(path), value, path)
 

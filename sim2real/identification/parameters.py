@@ -214,7 +214,7 @@ class ParameterTable:
         """Return the table with some optional terms; parameters of absent terms are fixed at ``without``.
 
         Raises:
-            UsageError: When a term is unknown.
+            UsageError: A term is unknown.
         """
         names = set(names)
         terms = dict.fromkeys(p.term for p in self.parameters if p.term)

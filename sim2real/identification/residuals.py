@@ -316,7 +316,7 @@ class Problem:
         raw = self._raw(points, self._fitted_states(x, part, fresh=True), part)
         return robust(raw, self.config.reach)[0]
 
-    def liveliest(self, part: Part, most: int | None = None) -> Part:
+    def segments_with_most_motion(self, part: Part, most: int | None = None) -> Part:
         """Return the segments with most motion: the best of each channel, then the second best of each, and so on.
 
         If recordings are few, each has a segment among them.
@@ -563,7 +563,7 @@ def thinned(problem: Problem, parts: np.ndarray, most: float) -> Problem:
         return problem
     live, (each, more) = np.zeros(len(problem.train), bool), divmod(keep, len(parts))
     for k, touched in enumerate(parts):
-        live |= problem.liveliest(problem.part(problem.train[~touched]), each + (k < more)).live
+        live |= problem.segments_with_most_motion(problem.part(problem.train[~touched]), each + (k < more)).live
     return problem.recut([problem.spans[i] for i in problem.train[live]], problem.segment_s)
 
 

@@ -130,7 +130,7 @@ class GraphOnC:
     def inputs(
         self, gs: GraphState, params: Mapping[str, PyTree], tables: Tables, messages: Mapping[str, PyTree]
     ) -> PhysicsInputs:
-        """Return the inputs of C for an episode; traceable."""
+        """Return what MuJoCo's C functions need to simulate an episode; traceable."""
         world = self._world
         state, world_params = gs.state[world.name], params[world.name]
         law = world.law_values(world_params) if self._law else {}

@@ -78,7 +78,7 @@ def search(
         on_generation: Called with the best loss and the best candidate so far.
 
     Raises:
-        UsageError: When the strategy is unknown, or does not work with the population.
+        UsageError: The strategy is unknown, or does not work with the population.
         Sim2RealError: When every loss is infinite or no number.
     """
     strategy, params = _strategy(config, len(start))
@@ -227,7 +227,7 @@ def minimise(
         compiled: Whether JAX compiles the loss; otherwise it is plain Python and is called for each candidate in turn.
 
     Raises:
-        UsageError: When parameters and bounds do not fit each other, or the loss is not one number.
+        UsageError: Parameters and bounds do not fit each other, or the loss is not one number.
         Sim2RealError: When the loss is nowhere finite.
     """
     if lacking := sorted(set(parameters) ^ set(bounds)):

@@ -56,7 +56,7 @@ class MjxWorld(BaseWorld):
         field: Field of that input's message: shape ``(nu,)`` [the actuators' unit].
 
     Raises:
-        UsageError: When the tick is no whole number of time steps, or the model asks for what MJX does otherwise:
+        UsageError: The tick is no whole number of time steps, or the model asks for what MJX does otherwise:
             delays of its own (ignored or misplaced there; they belong to the graph), the no-slip solver, an integrator
             that it does not have, springs without dampers.
     """

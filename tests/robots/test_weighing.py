@@ -96,7 +96,7 @@ def test_a_load_outside_of_its_range_is_a_warning_and_the_rest_stays(standing, c
 def test_a_load_near_the_end_of_its_range_is_accepted_though_its_error_puts_it_outside(standing):
     """A load of 2.9 kg was estimated as 3.02, give or take 0.3, and was then not identified at all."""
     episode, values, _ = standing
-    row = next(p for p in ROBOT.model.around() if p.name == "payload")
+    row = next(p for p in ROBOT.model.parameters_without_joint() if p.name == "payload")
     balances = weighing.balances_of(ROBOT, episode, values)
 
     def stronger(share):

@@ -116,7 +116,7 @@ def test_a_robot_that_would_fall_is_held_until_it_is_told(tmp_path, clocks, monk
         held_ns.append(clocks[0].monotonic_ns())
         return len(held_ns) > 25  # half a second
 
-    monkeypatch.setattr(episode, "_told", told)
+    monkeypatch.setattr(episode, "_enter_pressed", told)
     bundle = make_bundle("arm", tmp_path, 0.2)
     code, said, folder = deploy(tmp_path, "arm", bundle, "--hold", "--duration-s", 1)
     assert code == 0

@@ -469,9 +469,9 @@ class Element:
         return frame
 
     @property
-    def _says(self) -> bool:
+    def _has_content(self) -> bool:
         """Whether the element has content or was added explicitly."""
-        return not self._spec.implicit or bool(self._given) or any(c._says for c in self._with_attached())
+        return not self._spec.implicit or bool(self._given) or any(c._has_content for c in self._with_attached())
 
     def is_same_as(self, other: Element | None) -> bool:
         """Return whether another element has the same tag, attributes and children."""
@@ -487,7 +487,9 @@ class Element:
             return False
         ordered = self.kind == "tendon"  # compare the order of a path's elements
         for tag in (None,) if ordered else self._spec.children:
-            one, two = ([c for c in e._with_attached() if tag in (None, c._tag) and c._says] for e in (self, other))
+            one, two = (
+                [c for c in e._with_attached() if tag in (None, c._tag) and c._has_content] for e in (self, other)
+            )
             if len(one) != len(two) or not all(a.is_same_as(b) for a, b in zip(one, two, strict=True)):
                 return False
         return True

@@ -81,7 +81,7 @@ class BasePhysics(ABC):
         """Set positions, velocities and activations, shape ``(nq + nv + na,)``.
 
         Raises:
-            UsageError: When the shape is another.
+            UsageError: The shape is another.
         """
         model, xp = self.model.ptr, self.np
         expected = (model.nq + model.nv + model.na,)

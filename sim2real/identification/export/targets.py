@@ -99,7 +99,7 @@ def source_of(target: str, terms: Terms, title: str, about: Sequence[tuple[str, 
     """Return the Python file for a target, with the actuators and the events that randomise them.
 
     Raises:
-        UsageError: When an actuator's command is no position.
+        UsageError: An actuator's command is no position.
     """
     others = [name for name, own in terms.joints.items() if "gain" in own]
     if others or not terms.all_positions:

@@ -49,7 +49,7 @@ def import_file(
         episode: Number of the episode of a LeRobot data set; default: the only one.
 
     Raises:
-        UsageError: When the file or the mapping cannot be read, they do not fit each other, the signals of a node
+        UsageError: The file or the mapping cannot be read, they do not fit each other, the signals of a node
             differ in length, a gain lacks most of its numbers, a position jumps, or stamps do not increase.
     """
     chosen = mapping if isinstance(mapping, ImportMapping) else load_mapping(mapping)

@@ -28,7 +28,7 @@ def read_file(path: Path, contacts: bool) -> tuple[Any, list[str]]:
         contacts: Whether bodies touch, so that all meshes are needed.
 
     Raises:
-        UsageError: When the file is missing, or MuJoCo cannot read or compile it.
+        UsageError: The file is missing, or MuJoCo cannot read or compile it.
     """
     if not path.is_file():
         why = f"the model {path} is a folder" if path.is_dir() else f"there is no model {path}"

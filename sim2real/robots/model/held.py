@@ -277,7 +277,7 @@ def _pose(model: MjModel, held: Mapping[int, Held], joints: Mapping[int, Any]) -
         quat = np.zeros(4)
         mj.mju_mat2Quat(quat, (around.T @ turn).ravel())
         first = int(model.body_jntadr[body])
-        # Put a frame with the pose around the body.
+        # Put the body into a frame that has its pose, so that its own pose is zero.
         element = joints[first].parent
         pos = around.T @ (data.xpos[body] - data.xpos[parent])
         element.set_frame(element.parent.add_frame(pos=pos, quat=quat))

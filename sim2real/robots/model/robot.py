@@ -154,7 +154,7 @@ class MjcfRobot(LoggedRobot):
     """A robot that consists of a model and recordings.
 
     Raises:
-        UsageError: When the model does not fit.
+        UsageError: The model does not fit.
     """
 
     delayed = "command to angle"
@@ -210,7 +210,7 @@ class MjcfRobot(LoggedRobot):
         """Return sentences on recorded positions beyond a joint's range, or where a loop of the model cannot close.
 
         Raises:
-            UsageError: When a joint moves further than its range is wide.
+            UsageError: A joint moves further than its range is wide.
         """
         position, file = np.asarray(outputs[SENSOR]["position"], np.float64), self.config.model.name
         _check_payload(outputs.get(ACTUATOR, {}), self.config.commands)
@@ -378,7 +378,7 @@ def _beyond_ranges(model: MjModel, joints: Sequence[str], position: np.ndarray, 
     """Return a sentence on joints whose recorded positions ``(N, joints)`` often lie beyond the model's range.
 
     Raises:
-        UsageError: When a joint moves further than its range is wide.
+        UsageError: A joint moves further than its range is wide.
     """
     sentences = []
     for i, joint in enumerate(joints):

@@ -51,7 +51,7 @@ class LegsInAStand:
         self.channels, self._rate_hz, self._kd = robot.drive.channels, robot.policy_hz, robot.gains[1]
         self._joints, self._model = robot.model.joints, stand_model(robot.mjcf)
         # Each motor has a strength, so a common factor on all of them is not identified.
-        fixed = [replace(p, free=False) for p in robot.model.around() if p.name == STRENGTH]
+        fixed = [replace(p, free=False) for p in robot.model.parameters_without_joint() if p.name == STRENGTH]
         rows = [*self._joints.dynamics(), *fixed, *self._joints.zeros(), *delay_parameters(max_delay_s)]
         self.parameters = ParameterTable(rows)
         columns: dict[str, PyTree] = {"goal": "q", "goal_velocity": "dq", "torque": "tau", "kp": "kp", "kd": "kd"}

@@ -86,7 +86,7 @@ def weighed(
         return identification
     values, balances = identification.values, balances_of(robot, episode, identification.values)
     load = balances.load(robot, values)
-    row = next(p for p in robot.model.around() if p.name == PAYLOAD)
+    row = next(p for p in robot.model.parameters_without_joint() if p.name == PAYLOAD)
     # The spread of parts of the log is the error of the balances; the posterior adds that of the other parameters.
     edges = np.linspace(0, len(balances.size), _BLOCKS + 1).astype(int)
     parts = [balances.load(robot, values, slice(a, b)) for a, b in pairwise(edges)]

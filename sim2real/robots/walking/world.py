@@ -279,9 +279,9 @@ class WalkingModel(RobotModel):
         return float(self.task.control_timestep)
 
     def dynamics(self) -> list[Parameter]:
-        return [*self.around(), *self.joints.dynamics()]
+        return [*self.parameters_without_joint(), *self.joints.dynamics()]
 
-    def around(self) -> list[Parameter]:
+    def parameters_without_joint(self) -> list[Parameter]:
         """Return the parameters that belong to no joint; legs in the air determine none of them."""
         return [
             Parameter(FRICTION, "1", 0.8, 0.2, 2.0, about="friction of the feet on the ground"),

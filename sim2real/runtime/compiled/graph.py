@@ -156,7 +156,7 @@ class CompiledGraph:
             order: Names of nodes that are initialised first.
 
         Raises:
-            UsageError: When there is no such episode, or a name is unknown. A traced ``eps`` cannot be checked: in an
+            UsageError: There is no such episode, or a name is unknown. A traced ``eps`` cannot be checked: in an
                 episode that does not exist no step is made.
         """
         self._check_episode(eps)

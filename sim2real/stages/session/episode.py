@@ -242,11 +242,11 @@ def come_to_rest(graph: AsyncGraph, rig: Rig, hold: bool) -> None:
         graph.run_for(_REST_POLL_S)
     if hold:
         note("holding: support the robot, then press Enter to take the torque off", urgent=True)
-        while graph.running and not _told():
+        while graph.running and not _enter_pressed():
             graph.run_for(_REST_POLL_S)
 
 
-def _told() -> bool:
+def _enter_pressed() -> bool:
     """Wait a moment in real time, also with an emulated robot, and return whether Enter was pressed."""
     if not sys.stdin.isatty():  # a closed input would release the robot at once
         time.sleep(_REST_POLL_S)

@@ -133,7 +133,7 @@ class GraphEnvironment(TrainingEnvironment):
     def _step(self, data: PyTree, state: EnvState, action: jax.Array, key: jax.Array) -> Step:
         graph, task = self.graph.with_data(data[0]), with_data(self.task, data[1])
 
-        # The supervisor's step, and the rest of the row.
+        # Make the supervisor's step, then all other steps of the row.
         valid = jnp.asarray(state.step_state.seq >= 0)
         step_state, output = task.act(state.step_state, action)
         gs = graph.advance(state.graph, step_state, output, inside=True)

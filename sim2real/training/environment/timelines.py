@@ -217,7 +217,7 @@ def _draw_with_pauses(
 def _end_at_pauses(
     nodes: Mapping[str, BaseNode], supervisor: str, episode_s: float, count: int, stretches: Stretches, periods: float
 ) -> tuple[Timeline, np.ndarray]:
-    """Return timelines, calm from their first pause on, and the number of policy steps before it ``(E,)``."""
+    """Return timelines without long steps after a first pause, and the number of policy steps until then ``(E,)``."""
     last = np.full(count, np.iinfo(np.int64).max)
     rate_hz = nodes[supervisor].rate
     while True:
