@@ -55,7 +55,7 @@ def test_what_names_a_removed_element_stays_and_is_refused(reference, attached):
     if attached:
         mjcf.RootElement(model="w").attach(model)
     model.find(kind, name).remove()
-    with pytest.raises(UsageError, match=f"names the {kind} '{name}', which was removed"):
+    with pytest.raises(UsageError, match=f"refers to the {kind} '{name}', which was removed"):
         model.root_model.compile()
     plain = robot()
     plain.find("material", "skin").remove()  # a material is forgotten
@@ -371,7 +371,7 @@ def test_files_are_collected_and_written(tmp_path):
     found = {file.name: file.read_bytes() for file in (tmp_path / "root").iterdir()}
     assert found == {file.name: file.read_bytes() for file in (tmp_path / "out").iterdir()}
     (tmp_path / "part.xml").unlink()
-    with pytest.raises(UsageError, match=r"includes 'part\.xml', which is not there"):
+    with pytest.raises(UsageError, match=r"includes 'part\.xml', which does not exist"):
         mjcf.from_path(tmp_path / "arm.xml")
 
 

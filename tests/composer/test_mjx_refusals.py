@@ -85,7 +85,7 @@ TYPES = {
         (after(count), r"Rod.n is changed by Rod.after_step.*same value\s+hint: keep .* physics.variables\['n'\]"),
         (start(count), "Rod.n is changed by Rod.initialize_episode"),
         (after(lambda task, _: task.counts.append(1)), "Rod.counts is changed by Rod.after_step"),
-        (after(remember), r"Rod.memory was set by a hook, Rod.after_step, to a value that only exists"),
+        (after(remember), r"Rod.memory was set by a hook, Rod.after_step, to a value that exists only"),
         (start(lambda task, _: task.random.uniform()), "Rod.random is changed by Rod.initialize_episode"),
         (start(lambda task, _: np.random.uniform()), "Rod.initialize_episode draws from a global source of randomness"),
         # What needs a number, with the way to do it, and the line.
@@ -241,7 +241,7 @@ def test_actions_of_a_task_s_own_and_after_compile():
     assert after.data.ctrl.shape == (1,)
     pytest.importorskip("gymnasium", reason="the vector environment: the extra interop")
     with pytest.raises(
-        UsageError, match=r"Steered shows its policy nothing: no observable is enabled\. There are: none"
+        UsageError, match=r"task Steered has no observation: no observable is enabled\. Available: none"
     ):
         composer.MjxVectorEnv(environment, 2)
 
