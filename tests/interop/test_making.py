@@ -41,6 +41,6 @@ def test_a_robot_that_shows_more_than_it_names_is_refused(pendulum):
     env = pendulum.env
     contract = contract_of(sim2real.load_robot("pendulum"), env.task, {})
     contract = replace(contract, observation=contract.observation[1:])
-    with pytest.raises(UsageError, match="observation terms have 16 entries, its task shows 19"):
+    with pytest.raises(UsageError, match="observation terms have 16 entries, its task has 19"):
         RobotEnvironment(env, contract)
     assert np.isfinite([e.low for e in pendulum.observation]).all()

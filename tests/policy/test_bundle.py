@@ -163,7 +163,7 @@ def test_a_contract_that_does_not_fit_is_refused(bundle, change, message):
             r"layers\.1\.kernel has shape \(3, 64\), the contract asks for \(64, 64\)",
         ),
         ("high", np.array([2.0, 0.2], np.float32), "high bounds are"),
-        ("std", np.nan, "std holds values that are not finite"),
+        ("std", np.nan, "std has values that are not finite"),
         ("std", 0.0, "standard deviations down to 0"),
         ("std", -1.0, "standard deviations down to -1"),
         ("layers.1.kernel", 1e38, r"layers\.1\.kernel holds values up to 1e\+38"),
