@@ -24,9 +24,7 @@ class BarePolicy:
         layers = range(sum("layers." in name for name in tensors) // 2)
         *self.hidden, self.out = [[self.w.pop(f"layers.{i}.{part}") for part in ("kernel", "bias")] for i in layers]
         if about["format_version"] != 1 or set(self.w) != {"log_std", "mean", "std", "low", "high"}:
-            raise ValueError(
-                f"numpy runs clipped tanh layers alone, not {sorted(self.w)}: run policy.onnx with onnxruntime"
-            )
+            raise ValueError(f"not only clipped tanh layers, but {sorted(self.w)}: run policy.onnx with onnxruntime")
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         x = np.clip((np.asarray(observation, np.float32) - self.w["mean"]) / self.w["std"], -self.clip, self.clip)

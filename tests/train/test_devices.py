@@ -83,5 +83,5 @@ def test_devices_that_are_not_there_or_cannot_divide_the_copies_are_refused(monk
     with pytest.raises(UsageError, match="devices=64, but JAX finds 1 on this host"):
         mesh_of(PPOConfig(devices=64))
     monkeypatch.setattr("jax.local_devices", lambda: [SimpleNamespace(device_kind="cpu")] * 8)
-    with pytest.raises(UsageError, match="8 devices cannot divide 2 seeds of 6 copies: 4 devices a seed"):
+    with pytest.raises(UsageError, match="8 devices cannot divide 2 seeds of 6 copies: 4 devices for each seed"):
         mesh_of(PPOConfig(devices=8, num_seeds=2, num_envs=6, minibatches=2))

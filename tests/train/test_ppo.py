@@ -144,7 +144,7 @@ class Broken(Constant):
     [
         (Broken(low=np.nan), "action bounds must be two finite vectors"),
         (Broken(low=1.0), "low < high"),
-        (Broken(observation=np.zeros(3, np.float32)), r"step's observation has shape \(3,\).*promises \(1,\)"),
+        (Broken(observation=np.zeros(3, np.float32)), r"step's observation has shape \(3,\).*observation_size is 1"),
         (Broken(reward=np.zeros(1, np.float32)), r"step's reward must be a number of shape \(\)"),
         (Broken(terminated=np.float32(0)), r"step's terminated must be a bool"),
         (Broken(metrics={"x": np.zeros(2)}), r"step's metrics\['x'\] must be a number"),
