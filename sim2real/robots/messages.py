@@ -79,6 +79,7 @@ class Trials(NamedTuple):
         rest: The measured positions ``(channels,)`` at the start of each trial.
         duration_s: Length of an episode [s].
         node: The node whose states are scored: the world, or the sensor.
+        blend_s: Time in which the action grows from 0 to the policy's [s], as on the robot.
     """
 
     parameters: Sequence[Mapping[str, float]]
@@ -86,6 +87,7 @@ class Trials(NamedTuple):
     rest: Sequence[np.ndarray]
     duration_s: float
     node: str
+    blend_s: float = 0.0
 
 
 def as_columns(fields: Mapping[str, PyTree]) -> dict[str, np.ndarray]:

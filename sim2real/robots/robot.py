@@ -337,9 +337,11 @@ class Robot(RecordedRobot):
         Default: in the compiled graph, from where the robot rested.
         """
         from sim2real.robots.training import simulate
-        from sim2real.training.networks.policy import Policy
+        from sim2real.training.networks.policy import BlendedPolicy, Policy
 
-        return simulate(self, Policy.from_weights(bundle.weights, bundle.spec), trials)
+        policy = Policy.from_weights(bundle.weights, bundle.spec)
+        steps = trials.blend_s * bundle.contract.rate_hz
+        return simulate(self, BlendedPolicy(policy, steps) if steps else policy, trials)
 
 
 PARTS: Mapping[str, type] = {

@@ -132,7 +132,7 @@ def simulate(robot: Robot, policy: PyTree, trials: Trials) -> list[tuple[States,
     from sim2real.runtime.compiled.graph import CompiledGraph
 
     # Draw the timelines.
-    parameters, computation, rest, duration_s, node = trials
+    parameters, computation, rest, duration_s, node, _ = trials
     nodes, _ = training_loop(robot, parameters[0], {}, computation, True)
     if (solve_to_rest := getattr(nodes[WORLD], "solve_to_rest", None)) is not None:
         solve_to_rest()

@@ -77,6 +77,16 @@ def test_a_policy_is_let_in_slowly_in_every_episode(bundle, observations):
         np.testing.assert_allclose(shares, np.outer([0.0, 0.25, 0.5, 0.75, 1.0, 1.0], [1.0, 1.0]), rtol=1e-6)
 
 
+def test_a_simulated_deployment_lets_the_policy_in_as_the_robot_does(bundle, weights, observations):
+    from sim2real.training.networks.policy import BlendedPolicy, Policy
+
+    on_robot, simulated = BlendedRunner(load_bundle(bundle), 0.08), BlendedPolicy(Policy.from_weights(weights), 4.0)
+    carry = simulated.initial_carry()
+    for observation in observations[:7]:
+        carry, action = simulated.step(carry, observation)
+        np.testing.assert_allclose(action, on_robot(observation), atol=2e-6)
+
+
 def test_a_robot_that_leans_too_far_is_stopped(bundle, observations):
     policy = load_bundle(bundle)
     leaning = UprightRunner(policy, lambda seen: float(seen[0]), 0.5)

@@ -8,7 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import struct
+from live_robots import make_bundle
 
+from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.timing import Timing
 from sim2real.graph.base import Base
@@ -91,3 +93,17 @@ def test_simulated_measurements_are_compared_with_measurements():
     moving = at_s > 0.1
     np.testing.assert_allclose(sensor["th"][moving], then[moving], atol=1e-4)
     assert np.abs(sensor["th"] - np.interp(at_s, t_s, world["th"]))[moving].max() > 0.03
+
+
+def test_a_policy_that_is_let_in_slowly_is_simulated_so(tmp_path):
+    robot = load_robot("pendulum")
+    bundle = Bundle.load(make_bundle("pendulum", tmp_path, bias=0.5))
+    values = robot.nominal() | {"sensor_delay": 0.01, "actuator_delay": 0.01}
+    episode = Episode(steps={n: steps(30) for n in ("sensor", "agent", "actuator")}, messages={}, outputs={})
+    computation, rest = Timing.of(episode).computation()[0], [np.array([np.pi])]
+    whole, blended = (
+        robot.simulated(bundle, Trials([values], computation, rest, 0.4, "world", blend_s))[0][0][1]["command"]
+        for blend_s in (0.0, 0.2)
+    )
+    assert np.ptp(whole) == 0.0
+    np.testing.assert_allclose(blended[:13] / whole[0], np.minimum(1.0, np.arange(13) / 10), atol=0.11)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, ClassVar
 import jax
 
 from sim2real.emulation.body import Terrain
+from sim2real.policy.runner import BlendedRunner
 from sim2real.robots.loop import DELAYS
 from sim2real.robots.messages import States, Trials
 from sim2real.robots.robot import Robot
@@ -95,7 +96,7 @@ class ComposedRobot(Robot):
         """Return one episode of each trial in C MuJoCo: its graph takes over ten minutes to compile on a processor."""
         from sim2real.robots.walking.twin import episode
 
-        runner, nominal, length_s = bundle.runner(), self.nominal(), trials.duration_s
+        runner, nominal = BlendedRunner(bundle.runner(), trials.blend_s), self.nominal()
         values = [nominal | dict(row) for row in trials.parameters[: len(trials.rest)]]
-        played = [episode(self, runner, row, number, length_s) for number, row in enumerate(values)]
+        played = [episode(self, runner, row, number, trials.duration_s) for number, row in enumerate(values)]
         return [(states, states) for states in played]

@@ -31,6 +31,7 @@ def compare(
     bundle: Bundle,
     identification: Identification | None,
     duration_s: float,
+    blend_s: float = 0.0,
 ) -> Deployment:
     """Return the table of a deployment's episodes: scores on the robot and in simulation, late steps and pauses.
 
@@ -41,9 +42,11 @@ def compare(
             nominal values. The first simulation of each episode has the estimates, the others have draws from the
             posterior.
         duration_s: Length of a simulation [s].
+        blend_s: Time in which the action grew from 0 to the policy's on the robot [s].
     """
     use_truth = all(r.true_states() is not None for r in recordings)
-    pairs = _simulated(robot, recordings, bundle, identification, duration_s, WORLD if use_truth else SENSOR)
+    node = WORLD if use_truth else SENSOR
+    pairs = _simulated(robot, recordings, bundle, identification, duration_s, node, blend_s)
     count, rows = len(recordings), []
     for i, recording in enumerate(recordings):
         real = _finite(robot.task.score(*_recorded(recording, robot, use_truth)))
@@ -94,6 +97,7 @@ def _simulated(
     identification: Identification | None,
     duration_s: float,
     node: str,
+    blend_s: float = 0.0,
 ) -> list[tuple[States, States]]:
     """Return the simulations of a policy, see ``Robot.simulated``; empty without parameters, or usual step times."""
     if not has_jax():
@@ -109,7 +113,7 @@ def _simulated(
         computation, hiccups = recordings[0].timing.computation(1.0 / robot.drive.rate_hz)
         rest = [_rest(robot, recording.episode) for recording in recordings]
         with progress(None, "simulate the same"):
-            trials = Trials(parameters, computation, rest, duration_s, node)
+            trials = Trials(parameters, computation, rest, duration_s, node, blend_s)
             pairs = patiently(lambda: robot.simulated(bundle, trials))
     except Sim2RealError as error:
         note(f"warning: nothing to compare with: {error.args[0]}")

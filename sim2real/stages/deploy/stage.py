@@ -92,7 +92,7 @@ def _deployed(
     from sim2real.stages.deploy.simulation import compare
     from sim2real.stages.deploy.verdict import judge
 
-    deployment = compare(robot, recordings, bundle, identification, config.duration_s)
+    deployment = compare(robot, recordings, bundle, identification, config.duration_s, config.blend_s)
     probe = Recording.load(folder / PROBE) if (folder / PROBE).is_file() else None
 
     # Judge the model and the policy.

@@ -193,3 +193,25 @@ def _named(params: PyTree) -> list[tuple[str, Array]]:
     """Return the arrays of a user's network with their paths as names."""
     leaves = jax.tree_util.tree_leaves_with_path(params)
     return [(f"network.{jax.tree_util.keystr(path, simple=True, separator='.')}", leaf) for path, leaf in leaves]
+
+
+@pytree.dataclass
+class BlendedPolicy(Base):
+    """A policy whose action grows linearly from 0 to the policy's: ``BlendedRunner`` in a compiled graph.
+
+    Attributes:
+        steps: Number of steps, above 0, until the action is the policy's.
+    """
+
+    policy: Policy
+    steps: float
+
+    def initial_carry(self) -> PyTree:
+        """Return the carry into an episode's first step: the number of the step, and the policy's carry."""
+        return jnp.float32(0.0), self.policy.initial_carry()
+
+    def step(self, carry: PyTree, observation: jax.Array) -> tuple[PyTree, jax.Array]:
+        """Return the next carry, and a share of the policy's action, shape ``(A,)``."""
+        number, inside = carry
+        inside, action = self.policy.step(inside, observation)
+        return (number + 1.0, inside), action * jnp.minimum(1.0, number / self.steps)
