@@ -505,7 +505,7 @@ class Identification(Shown):
         first, joints = self.expected_error[0], {e.joint for e in self.expected_error}
         own = [f"{with_small_unit(e.error, e.unit)} {e.how}" for e in self.expected_error if e.joint == first.joint]
         which = f", the worst of {len(joints)} joints" if len(joints) > 1 else ""
-        return f"{first.joint} {', '.join(own)}{which}"
+        return f"{first.joint} {', '.join(own)}{which}, for motion like the fitted one"
 
     def expected_of(self, joint: str, free_run: bool = False) -> ExpectedError | None:
         """Return the expected error of a joint; None if there is none."""
