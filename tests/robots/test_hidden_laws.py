@@ -217,7 +217,7 @@ def test_a_limit_that_is_named_and_was_not_reached_has_no_number(tmp_path):
     robot, episode = stepped(tmp_path)
     findings = Findings.of(fit(problem_of(robot, [episode], "torque_limit")))
     at = findings.fit.problem.table.names.index("torque")
-    assert findings.spread.verdict[at] == NOT_REACHED
+    assert findings.spread.state[at] == NOT_REACHED
     assert findings.spread.low[at] > 1.0
 
 
