@@ -485,10 +485,8 @@ class Problem:
         shifts = (shift[:, None] + moves).reshape(-1, self._n)
         errors = self.errors(spread, np.repeat(segments, len(moves)), shifts)
         errors = np.moveaxis(errors.reshape(len(segments), len(moves), *errors.shape[1:]), 1, 0)
-        changes, width = (
-            errors[1 : len(groups) + 1] - errors[len(groups) + 1 :],
-            np.full(self._n, 2 * _STATE_DIFFERENCE),
-        )
+        changes = errors[1 : len(groups) + 1] - errors[len(groups) + 1 :]
+        width = np.full(self._n, 2 * _STATE_DIFFERENCE)
         return np.moveaxis(self._state_groups.spread(changes, groups, width), 0, 1), errors[0]
 
     def with_readings(self, readings: Mapping[str, np.ndarray]) -> Problem:

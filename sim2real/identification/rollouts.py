@@ -34,6 +34,8 @@ On C, a Jacobian of 20 logs took 24 s of processor time with at most 128 copies,
 a row share timing and messages, and a CPU's cache holds what 128 copies need: an arm's rollouts took 0.65 s instead of
 1.23 s with 1,024 copies of any segments.
 """
+_STARTS = 24
+"""Initial states are computed in multiples of this number, so that few programs are compiled."""
 _MANY = 256
 """Copies from which on rows are worth a program of their own."""
 
@@ -238,7 +240,7 @@ class Rollouts:
     ) -> np.ndarray:
         """Return initial states ``(N, 2 * channels)``: positions, then velocities; arguments as in ``errors``."""
         program = self._program("starts", lambda v, e, s, data: self._started(v, e, s, data)[1])
-        size = -(-len(segment) // 24) * 24
+        size = -(-len(segment) // _STARTS) * _STARTS
         copies = {n: v[:, None] for n, v in values.items()}, segment, (shift * self.prior)[:, None]
         return np.asarray(program(*padded(_single(copies), size), data), np.float64)[: len(segment), 0]
 

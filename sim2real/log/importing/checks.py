@@ -300,8 +300,10 @@ def _judge(
     rival = int(np.argmax(alike))
     copied = moves and lead_r > 0.95 and is_copy(t_s, goal[:, i], position[:, i], lead_s)
     away = f"{name} is held at {level:.3g} by a goal of {held:.3g}: another sign, unit or zero"
-    scale = f"{name} follows its goal (r {r:.2f}) with a slope of {slope:.3g}: unit or scale of one of them is wrong"
-    weak = scale.partition(":")[0] + ": another unit or scale, or a drive too weak for its load?"
+    follows = f"{name} follows its goal (r {r:.2f}) with a slope of {slope:.3g}"
+    scale = f"{follows}: unit or scale of one of them is wrong"
+    weak = f"{follows}: another unit or scale, or a drive too weak for its load?"
+    resting = f"{name}'s goal" if found.spread[1][i] > _STILL else name
     before = f"{name} moves {-lead_s:.3g} s before its goal: names are exchanged, or the clocks do not agree"
     table: list[tuple[str, Weight, bool, str]] = [
         ("copy", "refuse", copied,
@@ -309,7 +311,7 @@ def _judge(
         ("sign", "ask", is_elsewhere and abs(level + held) < 0.3 * abs(held), away),
         ("slope", "ask", is_elsewhere, away),
         ("still", "warn", not moves,
-         f"{name}{_rests(found, i)} hardly moves: sign, order and unit are not checked"),
+         f"{resting} hardly moves: sign, order and unit are not checked"),
         ("order", "refuse", other_r > 0.9 and best < 0.6,
          f"{name} follows the goal of {names[other]} (r {other_r:.2f}), not its own (r {best:.2f})"),
         ("order", "ask", is_unclear,
@@ -327,10 +329,6 @@ def _judge(
     ]  # fmt: skip
     wrong = next((Check(name, i, text, weight) for name, weight, holds, text in table if holds), None)
     return wrong, moves
-
-
-def _rests(found: Response, i: int) -> str:
-    return "'s goal" if found.spread[1][i] > _STILL else ""
 
 
 def _is_clear(r: float, other_r: float, misfit: float, other_misfit: float) -> bool:

@@ -413,8 +413,8 @@ class Proposal:
                         f"{signal.name!r} holds whole counts of the calibration in {unit}, not in {self.hints.unit}",
                         hint=f"--unit {unit}; --as-told imports it all the same",
                     )
-            hers = self.table.robot or (self.hints.unit == "deg" and all(name.endswith(".pos") for name in names))
-            if hers and not calibration and (jaws := list(filter(lerobot.is_gripper, signal.labels))):
+            of_lerobot = self.table.robot or (self.hints.unit == "deg" and all(name.endswith(".pos") for name in names))
+            if of_lerobot and not calibration and (jaws := list(filter(lerobot.is_gripper, signal.labels))):
                 raise UsageError(
                     f"LeRobot writes {', '.join(jaws)} as 0 to 100 % of its range, which is no angle",
                     hint="--calibration FILE.json converts it",

@@ -169,7 +169,7 @@ def determined(fits: Fits, check: Determined, spread: Uncertainty) -> tuple[Fits
     """
     inputs, estimate, groups, sentences = fits.inputs, fits.estimate, check.undetermined, list[str]()
     table, tried = estimate.problem.table, set[str]()
-    absent = [n for n, verdict in zip(table.names, spread.state, strict=True) if verdict in (ABSENT, NOT_REACHED)]
+    absent = [n for n, state in zip(table.names, spread.state, strict=True) if state in (ABSENT, NOT_REACHED)]
     able = {p.name for p in table if p.kind == "dynamics" and not p.term}
     while names := [n for group in groups for n in group if n in able - tried]:
         # Begin with parameters that a model may lack, such as an inertia of the rotor.

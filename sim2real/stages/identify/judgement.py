@@ -124,10 +124,10 @@ class Findings:
         at = fit.problem.linearise(fit.x)
         spread = widened(from_linearised(fit.problem, at), fit.problem.table, at, without)
         table = fit.problem.table
-        one_sided = [n for n, v in zip(table.names, spread.state, strict=True) if v in (ABSENT, NOT_REACHED)]
+        one_sided = [n for n, state in zip(table.names, spread.state, strict=True) if state in (ABSENT, NOT_REACHED)]
         check = what_is_determined(fit.problem, at, one_sided)
         # The loss does not depend on a limit that no motion reaches: such a limit stays nominal.
-        x = np.where([v == NOT_REACHED for v in spread.state], np.maximum(table.nominal(), at.x), at.x)
+        x = np.where([state == NOT_REACHED for state in spread.state], np.maximum(table.nominal(), at.x), at.x)
         return Findings(replace(fit, x=x), replace(at, x=x), spread, check, posterior_widening(at, spread))
 
 
