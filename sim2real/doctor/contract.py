@@ -107,8 +107,9 @@ class Contract(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
         setting = getattr(self, name)
         if isinstance(setting, dict):
             matched = [[v for p, v in setting.items() if re.fullmatch(p, joint)] for joint in self.joints]
-            if bare := [joint for joint, found in zip(self.joints, matched, strict=True) if len(found) != 1]:
-                raise UsageError(f"no pattern of {name} matches joint {bare[0]}")
+            for joint, found in zip(self.joints, matched, strict=True):
+                if len(found) != 1:
+                    raise UsageError(f"{len(found) or 'no'} patterns of {name} match joint {joint}; exactly one must")
             return np.array([found[0] for found in matched], float)
         value = np.asarray(setting, float)
         if value.size not in (1, len(self.joints)):

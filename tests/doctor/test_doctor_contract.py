@@ -191,6 +191,13 @@ def test_metadata_of_mjlab_lack_the_rate_alone(tmp_path: Path) -> None:
     assert contract.layout[2:4] == [(2, 1), (2, 0)]
 
 
+def test_each_joint_has_one_pattern() -> None:
+    contract = Contract(50.0, ("fl_hip", "fr_hip"), 0.0, 0.5, (Term("joint_pos"),))
+    for patterns, said in (({"fl.*": 1.0}, "no .*fr_hip"), ({".*": 1.0, "fl.*": 2.0}, "2 .*fl_hip")):
+        with pytest.raises(UsageError, match=said):
+            msgspec.structs.replace(contract, kp=patterns).per_joint("kp")
+
+
 def test_metadata_have_any_form_of_a_number(tmp_path: Path) -> None:
     forms = METADATA | {"joint_stiffness": "2e+01, 3.0E1, +40, 50.", "action_scale": "[.25]", "step_dt": "0.02"}
     contract = read_policy(written(tmp_path, forms), out=tmp_path).contract
